@@ -22,7 +22,8 @@ def _limited(text: str) -> str:
     """Keep the beginning and the end of a long text."""
     if len(text) <= MAX_LINE_LENGTH:
         return text
-    kept = MAX_LINE_LENGTH // 2 - 30  # with the note, the text stays within the limit
+    # With the note, the text stays within the limit.
+    kept = MAX_LINE_LENGTH // 2 - 30
     return f"{text[:kept]} [... {len(text) - 2 * kept:,} more characters ...] {text[-kept:]}"
 
 
@@ -97,9 +98,8 @@ class RecipeError(CnpgenError):
 
     def __init__(self, errors: Sequence[str]) -> None:
         self.errors = tuple(_limited(error) for error in errors)
-        Exception.__init__(
-            self, self.errors
-        )  # required for pickling in worker processes
+        # Required for pickling in worker processes.
+        Exception.__init__(self, self.errors)
 
     def __str__(self) -> str:
         return "\n".join(self.errors)
@@ -162,7 +162,8 @@ def requires_extra(extra: str, package: str, options: str = "") -> Iterator[None
         ImportError,
         OSError,
         AttributeError,
-    ) as error:  # broken installations raise any of them
+    ) as error:
+        # Broken installations raise any of them.
         raise MissingExtraError(
             f"{package} cannot be imported ({error}): pip install 'cnpgen[{extra}]'{options}"
         ) from error

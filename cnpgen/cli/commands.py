@@ -68,7 +68,8 @@ def load_command(name: str) -> ModuleType:
         module: ModuleType = addons.load_entry(entry, f"the command {name!r}")
     except CnpgenError:
         raise
-    except Exception as error:  # modules of packages may raise any exception
+    except Exception as error:
+        # Modules of packages may raise any exception.
         text = f"{type(error).__name__}: {error}"
         message = f"the command {name!r} cannot be imported: {text}"
         raise MachineError(message) from error

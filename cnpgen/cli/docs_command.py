@@ -85,9 +85,8 @@ def list_pages() -> dict[str, Path]:
             f"{folder} has no pages of the documentation: reinstall cnpgen"
         )
     pages = {"index": folder / "index.md"}
-    lists = page_text(pages["index"]).partition("## Tutorials")[
-        2
-    ]  # the table above it repeats some links
+    # The table above it repeats some links.
+    lists = page_text(pages["index"]).partition("## Tutorials")[2]
     for kind in KINDS:
         prefix = "benchmarks/" if kind == "benchmarks" else ""
         files = sorted(

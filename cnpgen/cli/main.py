@@ -74,10 +74,11 @@ stdout is data, stderr everything else. Exit codes:
 COMPLETION = "cnpgen.completion"  # functions that print completions and end the process
 _VERBOSE = {"-v", "--verbose", "--debug"}  # options that show tracebacks
 BROKEN_PIPE = 141  # 128 + SIGPIPE, as shells have it
+# Arguments whose options have another name.
 _OPTIONS = {
     "discard": "force",
     "other": "other_rows",
-}  # arguments whose options have another name
+}
 
 
 class _LinkedParser(Parser):
@@ -126,7 +127,8 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 def _run(words: list[str], given: argparse.Namespace) -> int:
     """Parse the words into ``given`` and run the command."""
-    if "_ARGCOMPLETE" in os.environ:  # set by the functions of argcomplete in the shell
+    if "_ARGCOMPLETE" in os.environ:
+        # Set by the functions of argcomplete in the shell.
         for entry in addons.installed(COMPLETION):
             entry.load()(build_parser())
     first = next((word for word in words if not word.startswith("-")), "")
@@ -138,7 +140,8 @@ def _run(words: list[str], given: argparse.Namespace) -> int:
             )
     try:
         arguments, extras = parser.parse_known_args(words, given)
-    except SystemExit:  # --help and --version have printed their text
+    except SystemExit:
+        # --help and --version have printed their text
         return 0
     chosen: Parser = getattr(arguments, "parser", parser)
     if extras:
@@ -148,7 +151,8 @@ def _run(words: list[str], given: argparse.Namespace) -> int:
         return 2
     level = "WARNING" if arguments.quiet else "DEBUG" if arguments.verbose else "INFO"
     with notices(level):
-        code: int = arguments.run(arguments) or 0  # most commands return nothing
+        # Most commands return nothing.
+        code: int = arguments.run(arguments) or 0
     return code
 
 
@@ -284,9 +288,8 @@ def _prepare_streams() -> None:
         if getattr(sys, name) is None:
             setattr(sys, name, Path(os.devnull).open("w", encoding="utf-8"))  # noqa: SIM115 - open until the end
     if isinstance(sys.stdout, io.TextIOWrapper):
-        sys.stdout.reconfigure(
-            errors="backslashreplace"
-        )  # a title must not stop a terminal that cannot show it
+        # A title must not stop a terminal that cannot show it.
+        sys.stdout.reconfigure(errors="backslashreplace")
 
 
 def _leave_pipe() -> int:

@@ -164,7 +164,8 @@ def make_metered(
     try:
         made = make(begin=begin, progress=count)
     except Exception:
-        raise_if_interrupted()  # the interruption also ended a compiler
+        # The interruption also ended a compiler.
+        raise_if_interrupted()
         raise
     except KeyboardInterrupt as interruption:
         raise type(interruption)(INTERRUPTED_TEXT) from interruption

@@ -14,9 +14,8 @@ from typing import Any, NoReturn, Protocol
 from cnpgen.cli import values
 from cnpgen.errors import UsageError, nearest
 
-_NEGATIVE = re.compile(
-    r"-\.?[0-9]"
-)  # how values begin: -5ms; before Python 3.14 argparse takes it for an option
+# How values begin: -5ms; before Python 3.14 argparse takes it for an option.
+_NEGATIVE = re.compile(r"-\.?[0-9]")
 
 
 class _Help(argparse.RawDescriptionHelpFormatter):
@@ -35,7 +34,8 @@ class Parser(argparse.ArgumentParser):
 
     def __init__(self, **options: Any) -> None:
         super().__init__(
-            allow_abbrev=False,  # a script must not break when an option is added
+            # A script must not break when an option is added.
+            allow_abbrev=False,
             formatter_class=_Help,
             **options,
         )
@@ -72,12 +72,10 @@ class Parser(argparse.ArgumentParser):
         )
 
 
-Commands = (
-    argparse._SubParsersAction
-)  # what ``add_subparsers`` returns: commands are added to it
-Options = (
-    argparse._ActionsContainer
-)  # a parser or a group of its options: options are added to it
+# What ``add_subparsers`` returns: commands are added to it.
+Commands = argparse._SubParsersAction
+# A parser or a group of its options: options are added to it.
+Options = argparse._ActionsContainer
 
 
 class Alternative(Protocol):
@@ -122,7 +120,8 @@ def add_command(
     parser = commands.add_parser(
         name, help=summary, description=title, epilog=text or None
     )
-    add_common(parser, default=argparse.SUPPRESS)  # keep an option before the command
+    # Keep an option before the command.
+    add_common(parser, default=argparse.SUPPRESS)
     module.add_options(parser)
     for alternative in alternatives:
         alternative.add_options(

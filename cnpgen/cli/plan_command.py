@@ -263,7 +263,8 @@ def _draws(arguments: argparse.Namespace, model: "Model") -> "Requests":
         )
     recipe = load_dataset_recipe(name)
     stages = plain(resolved(recipe.pipeline))["stage"]
-    is_own = arguments.model == name  # the shipped model of the recipe's name
+    # The shipped model of the recipe's name.
+    is_own = arguments.model == name
     check_stages(
         name,
         record_problem(recipe.pipeline.problem),

@@ -98,7 +98,8 @@ def _recipe_or_path(kinds: tuple[str, ...], text: str) -> str:
         and path.is_file()
         and kind_of_content(path) == "a text file"
     ):
-        check_recipe(text)  # has a hint for tables
+        # Has a hint for tables.
+        check_recipe(text)
         raise UsageError(
             f"{text} is a text file, expected a recipe (.toml) or an HDF5 file"
         )
@@ -142,9 +143,8 @@ def _recipe(kinds: "tuple[Kind, ...]", text: str) -> str:
     return text
 
 
-problem = partial(
-    _recipe, ("problem", "pipeline", "dataset")
-)  # or a recipe with the problem
+# or a recipe with the problem
+problem = partial(_recipe, ("problem", "pipeline", "dataset"))
 suite = partial(_recipe, ("suite", "dataset", "pipeline"))
 
 

@@ -28,6 +28,7 @@ if TYPE_CHECKING:
     from cnpgen.plans import Plans
     from cnpgen.refine.refinement import Refinement
 
+# What add_refining adds.
 REFINING = (
     "objective",
     "weight",
@@ -35,7 +36,7 @@ REFINING = (
     "tolerance",
     "deadline",
     "stay_within",
-)  # what add_refining adds
+)
 LARGE_ANGLES = (
     "accept boundary conditions in a file that are probably in degrees or millimetres"
 )

@@ -16,11 +16,12 @@ from cnpgen.schema.toml import MARKS, Kind, kind_of_file
 if TYPE_CHECKING:
     from cnpgen.cli.describe import Recipe
 
+# A dataset includes the other two.
 KINDS: tuple[Kind, ...] = (
     "dataset",
     "pipeline",
     "problem",
-)  # a dataset includes the other two
+)
 
 
 def add_options(parser: Parser) -> None:

@@ -94,9 +94,8 @@ def run(arguments: argparse.Namespace) -> int:
     if arguments.robot is not None:
         return _solve_scenes(arguments, out)
     problems = _problems(arguments)
-    make = (
-        refine_plans if math.isfinite(problems.duration[0]) else solve_plans
-    )  # rows of certified datasets have plans
+    # Rows of certified datasets have plans.
+    make = refine_plans if math.isfinite(problems.duration[0]) else solve_plans
     return refine_and_save(
         arguments, problems, out, title=f"solving {arguments.what}", make=make
     )
@@ -131,7 +130,8 @@ def _solve_scenes(arguments: argparse.Namespace, out: Path) -> int:
         ),
     )
     request = [
-        joblib.hash(scenes),  # with the meshes, which other files may hold
+        # With the meshes, which other files may hold.
+        joblib.hash(scenes),
         record_problem(problem).comparable_sha256,
         options_of(arguments, "payload"),
     ]

@@ -158,9 +158,8 @@ def run(arguments: argparse.Namespace) -> None:
         raise type(interruption)(kept) from interruption
     finally:
         watch.close()
-    if (
-        trained.made or not trained.path.with_suffix(".png").exists()
-    ):  # a run may have ended just before it was drawn
+    if trained.made or not trained.path.with_suffix(".png").exists():
+        # A run may have ended just before it was drawn.
         _draw(trained)
     if not arguments.quiet:
         print(summary(trained), file=sys.stderr)

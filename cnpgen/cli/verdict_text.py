@@ -205,6 +205,5 @@ def listing_text(found: "Evaluation") -> str:
         why = _why(verdict) or "-"
         rows.append((str(index), str(sample), str(verdict.reason), *figures, why))
     right = [column for column in range(len(rows[0])) if column != 2]
-    return "\n".join(
-        table(rows, right=right, width=sys.maxsize)
-    )  # one plan is one line, for grep and sort
+    # One plan is one line, for grep and sort.
+    return "\n".join(table(rows, right=right, width=sys.maxsize))

@@ -137,7 +137,8 @@ def load_library(paths: tuple[Path, ...], cache_folder: Path) -> ctypes.CDLL | N
     It is compiled if the cache lacks it; the result is None, after a warning, if that fails.
     """
     if built := find_built(paths):
-        with suppress(OSError):  # of another C library than the one of this system
+        # Of another C library than the one of this system.
+        with suppress(OSError):
             return ctypes.CDLL(str(built))
     try:
         return ctypes.CDLL(str(compile_source(paths, cache_folder)))
@@ -203,9 +204,8 @@ def compile_source(paths: Sequence[Path], cache_folder: Path) -> Path:
     try:
         make_private_folder(libraries)
         require_trusted(cache_folder)
-        with exclusive_lock(
-            libraries / f".{stem}.lock"
-        ):  # another process may have compiled it meanwhile
+        # Another process may have compiled it meanwhile.
+        with exclusive_lock(libraries / f".{stem}.lock"):
             return find_library(libraries, stem) or _build(stem, text, cache_folder)
     except OSError as error:
         raise _unusable(cache_folder, error) from error

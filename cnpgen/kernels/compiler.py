@@ -19,9 +19,10 @@ from cnpgen.errors import MachineError
 from cnpgen.machine.versions import processor_entry
 from cnpgen.store.files.cache_folder import default_cache_folder, temporary_folder
 
+# For Python's C API.
 _LINKER_FLAGS = (
     ("-Wl,-undefined,dynamic_lookup",) if platform.system() == "Darwin" else ()
-)  # for Python's C API
+)
 COMPILER_FLAGS = (  # no contraction to fused operations: equal bits on all processors
     "-std=gnu11", "-ffp-contract=off", "-fno-math-errno", "-fno-trapping-math", "-fPIC", "-shared", "-w",
     *_LINKER_FLAGS,
@@ -57,7 +58,8 @@ def find_compiler() -> str | None:
 def _words(command: str) -> list[str]:
     try:
         return shlex.split(command)
-    except ValueError:  # a quotation mark is not closed
+    except ValueError:
+        # A quotation mark is not closed.
         return []
 
 
@@ -130,7 +132,8 @@ def _run(
         "text": True,
         "errors": "replace",
     }
-    try:  # a compiler that reads a terminal would be stopped
+    try:
+        # A compiler that reads a terminal would be stopped.
         process = subprocess.Popen(
             command, stdin=subprocess.DEVNULL, process_group=0, env=variables, **texts
         )

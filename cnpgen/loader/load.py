@@ -53,7 +53,8 @@ def load_dataset(
         Path(local_folder(folder)),
         allow_incomplete=flag("allow_incomplete", allow_incomplete),
     )
-    folder = stored.folder.absolute()  # the working folder may change
+    # The working folder may change.
+    folder = stored.folder.absolute()
     stored = replace(stored, folder=folder)
     if stored.manifest is None:
         summary = summarize_dataset(folder, stored.spec, allow_incomplete=True)

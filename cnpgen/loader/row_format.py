@@ -90,10 +90,11 @@ class Normalization:
         Raises:
             DatasetError: A field has no statistics here.
         """
+        # Never normalized.
         of_scenes = {
             OBSTACLE_POSES,
             *(item.name for item in SCENE_ARRAYS),
-        }  # never normalized
+        }
         missing = [
             field.name for field in fields if field.name not in {*self.mean, *of_scenes}
         ]
@@ -241,7 +242,8 @@ class RowFormat:
     def convert(self, rows: Mapping[str, NDArray[Any]]) -> dict[str, NDArray[Any]]:
         """Convert stored rows, of shape (k, width) or (k,) each, to this format."""
         values = dict(rows)
-        if self.normalization is not None:  # in float64, as for batches
+        if self.normalization is not None:
+            # In float64, as for batches.
             values |= {
                 name: values[name].astype(np.float64, copy=False)
                 for name in self.layout.slices
@@ -273,9 +275,8 @@ def make_row_format(
     )
     layout = select_columns(spec, fields)
     if normalization is not None:
-        normalization.side_by_side(
-            layout.floats
-        )  # raises the error for a missing field here, and not in a thread
+        # Raises the error for a missing field here, and not in a thread.
+        normalization.side_by_side(layout.floats)
     return RowFormat(
         layout, normalization, _float_dtype(spec.dtype if dtype is None else dtype)
     )

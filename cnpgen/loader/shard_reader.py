@@ -108,12 +108,10 @@ class ShardReader:
         self._verify, self._obstacles = verify, tuple(obstacles)
         # Of the last shard whose scenes were read.
         self._scenes: tuple[Path, SceneTable] | None = None
-        self._placements: dict[
-            Path, dict[str, StoredField]
-        ] = {}  # of the checked shards
-        self._checked: dict[
-            Path, dict[str, Field]
-        ] = {}  # name -> field whose shape, type and values are checked
+        # Of the checked shards.
+        self._placements: dict[Path, dict[str, StoredField]] = {}
+        # Name -> field whose shape, type and values are checked.
+        self._checked: dict[Path, dict[str, Field]] = {}
         self._maps: dict[Path, mmap.mmap] = {}
 
     def __getstate__(self) -> dict[str, Any]:
@@ -181,7 +179,8 @@ class ShardReader:
             return {}
         scene_id = next(field for field in shard.spec.fields if field.name == SCENE_ID)
         index = self.read(shard, [scene_id])[SCENE_ID]
-        last = self._scenes  # other threads may replace it
+        # Other threads may replace it.
+        last = self._scenes
         if last is None or last[0] != shard.path:
             last = self._scenes = (
                 shard.path,
@@ -219,12 +218,12 @@ class ShardReader:
         try:
             with shard.path.open("rb") as file:
                 mapped = mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)
-        except (OSError, ValueError):  # the file is then read without mapping
+        except (OSError, ValueError):
+            # The file is then read without mapping.
             return None
         for oldest in list(self._maps)[: max(len(self._maps) - MAX_MEMORY_MAPS + 1, 0)]:
-            self._maps.pop(
-                oldest, None
-            )  # stays mapped as long as arrays of it are in use
+            # Stays mapped as long as arrays of it are in use.
+            self._maps.pop(oldest, None)
         self._maps[shard.path] = mapped
         return mapped
 

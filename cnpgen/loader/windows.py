@@ -322,9 +322,8 @@ class Windows:
         while index < len(self._firsts) and self._firsts[index] < last:
             window = self._order.windows[index]
             packed, rows = self._load(index)
-            skipped = (
-                max(-((first - window.first) // step), 0) * step
-            )  # positions in previous windows
+            # Positions in previous windows.
+            skipped = max(-((first - window.first) // step), 0) * step
             yield (
                 packed,
                 rows[first - window.first + skipped : last - window.first : step],
@@ -333,9 +332,8 @@ class Windows:
 
     def _load(self, index: int) -> Loaded:
         """Wait for a window, start loading the next one and release the previous ones."""
-        if (
-            self._process != os.getpid()
-        ):  # threads do not survive a fork, so their results would never arrive
+        if self._process != os.getpid():
+            # Threads do not survive a fork, so their results would never arrive.
             self._process, self._futures, self._memory = os.getpid(), {}, {}
         if index + 1 not in self._futures:
             self._futures = {

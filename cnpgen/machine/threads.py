@@ -15,9 +15,8 @@ VARIABLES = (
 )
 
 
-_preferred: dict[
-    str, str
-] = {}  # variables that this process has added to its environment
+# Variables that this process has added to its environment.
+_preferred: dict[str, str] = {}
 
 
 def prefer_one_thread() -> None:

@@ -46,9 +46,8 @@ def worker_count(workers: int | None, tasks: int) -> int:
     if workers is None:
         from joblib import effective_n_jobs
 
-        return max(
-            1, min(int(effective_n_jobs(-1)), tasks)
-        )  # of the backend of parallel_config, if any
+        # Of the backend of parallel_config, if any.
+        return max(1, min(int(effective_n_jobs(-1)), tasks))
     return max(1, min(integer("workers", workers, least=1), tasks))
 
 

@@ -150,7 +150,8 @@ def _completed(
         completion.context.robot,
         flat=completion.height is not None,
     )
-    if "parameters" in given:  # before a stage computes with them
+    if "parameters" in given:
+        # Before a stage computes with them.
         pipeline.problem.parameters.checked(given["parameters"])
     check_memory_of_rows(
         {name: len(rows) for name, rows in given.items()}, completion.width

@@ -76,7 +76,8 @@ def extend_dataset(
         notes = _notes(folder)
         if extended is not begun:
             check_writable(folder)
-            prepare(job)  # raises errors of this machine before anything is written
+            # Raises errors of this machine before anything is written.
+            prepare(job)
             delete_shards(folder, ())
             write_dataset_spec(folder, extended)
         remove_leftovers(folder / WORK)
@@ -118,7 +119,8 @@ def _extended(
 def _notes(folder: Path) -> str:
     """Read the notes from the card, their only copy in a dataset."""
     for document in dataset_documents():
-        with suppress(OSError, ValueError):  # a missing card has no notes
+        # A missing card has no notes.
+        with suppress(OSError, ValueError):
             text = utf8_text(
                 read_own(folder / document.file, folder / SPECIFICATION, "a card")
             )

@@ -55,9 +55,8 @@ class EndConditions:
             else problem
         )
         others = RobotClearance | SelfClearance
-        if any(
-            obstacle.below for obstacle in placed.obstacle
-        ):  # their places depend on both ends
+        if any(obstacle.below for obstacle in placed.obstacle):
+            # Their places depend on both ends.
             others |= ObjectContact
         self._constraints = [
             constraint

@@ -337,9 +337,8 @@ def find_damaged(
     Return damaged shard -> description.
     """
     damaged = {}
-    pool = ThreadPoolExecutor(
-        min(os.cpu_count() or 1, MAX_THREADS)
-    )  # sha256 releases the GIL
+    # sha256 releases the GIL
+    pool = ThreadPoolExecutor(min(os.cpu_count() or 1, MAX_THREADS))
     try:
         for task, problem in zip(
             tasks, pool.map(partial(_problem, folder, spec), tasks), strict=True

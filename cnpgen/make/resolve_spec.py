@@ -61,7 +61,8 @@ def resolve(
     total, root, shard_size = _check(recipe, n, seed, shard_size)
     digest, begun = recipe_digest(recipe), workspace.spec
     if begun is not None and (begun.recipe_sha256 != digest or force):
-        begun = None  # another dataset, or one that will be deleted
+        # Another dataset, or one that will be deleted.
+        begun = None
     if begun is not None:
         backend = begun.backend if backend is None else backend
         shard_size = begun.shard_size if shard_size is None else shard_size

@@ -364,9 +364,8 @@ def _states_of_pose(
     )
     if not len(found):
         return np.full((1, robot.n), np.nan)
-    return (
-        goals if len(goals) else found[:1]
-    )  # in collision: the explanation of the unsolved scene names it
+    # In collision: the explanation of the unsolved scene names it.
+    return goals if len(goals) else found[:1]
 
 
 def _frame_of(robot: Robot, scene: SceneProblem, pose: GoalPose) -> int | None:

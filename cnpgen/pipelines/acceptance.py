@@ -260,7 +260,8 @@ def narrow_phase_of_scenes(context: Context, end: End, *, exact: bool = True) ->
     _, symbolic_state = SymbolicState.of_symbols(
         context.robot, obstacles, problem.object_size, width
     )
-    conservative = ~by_distance  # the constraints with conservative conditions
+    # The constraints with conservative conditions.
+    conservative = ~by_distance
     for row in np.flatnonzero(conservative):
         conditions = problem.constraint[row].symbolic_at(symbolic_state, end)
         conservative[row] = any(condition.sufficient for condition in conditions)

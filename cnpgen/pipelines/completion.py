@@ -46,9 +46,8 @@ class Completion:
         fields = given_fields(steps, context)
         _check(pipeline, fields, given)
         self.context, self.given = context, {name: fields[name] for name in given}
-        self._fields = stored_fields(
-            steps, context
-        )  # tasks have no columns of the bookkeeping fields
+        # Tasks have no columns of the bookkeeping fields.
+        self._fields = stored_fields(steps, context)
         self.height = table_height(context)
         self._derived = _derived(given)
         known = {*given, *self._derived}
@@ -64,9 +63,8 @@ class Completion:
             end for end in ends if {f"{end}_q", f"{end}_dq", f"{end}_ddq"} & known
         ]
         self._accept = acceptance(context, written, given=stated)
-        self._random = np.random.default_rng(
-            0
-        )  # for plug-ins that bypass candidates.draw
+        # For plug-ins that bypass candidates.draw.
+        self._random = np.random.default_rng(0)
 
     @property
     def width(self) -> int:

@@ -22,6 +22,7 @@ from cnpgen.store.field import Field
 from cnpgen.store.scene_table import SCENE_ID
 
 MAX_STAGES = 100
+# Of every sample.
 REQUIRED_COLUMNS = (
     "start_q",
     "start_dq",
@@ -30,7 +31,7 @@ REQUIRED_COLUMNS = (
     "goal_dq",
     "start_xyz",
     "goal_xyz",
-)  # of every sample
+)
 # Stored order of the fields of the shipped stages; other fields follow in the order of
 # their stages.
 FIELD_ORDER = (

@@ -251,9 +251,8 @@ class BlockChunk:
         self, table: SceneTable, scene: NDArray[np.int64], rows: slice, accepted: int
     ) -> None:
         """Append the scenes of some rows of a batch; IDs are rows of the block."""
-        first_rows = accepted + np.searchsorted(
-            scene, scene
-        )  # of the scene of each row
+        # Of the scene of each row.
+        first_rows = accepted + np.searchsorted(scene, scene)
         ids, index = np.unique(first_rows[rows], return_index=True)
         self._parts[-1][SCENE_ID] = first_rows[rows][None]
         self._scenes.append(replace(table[scene[rows][index]], scene_ids=ids))
@@ -284,9 +283,8 @@ class BlockChunk:
             self._rejections[reason] = self._rejections.get(reason, 0) + number
         self._stages.update(candidates.origins)
         self._tried += stop - start
-        self._maps = [
-            field for field in self._maps if field.name in candidates.drawn
-        ]  # not those of scenes
+        # Not those of scenes.
+        self._maps = [field for field in self._maps if field.name in candidates.drawn]
         for field in self._maps:
             cells = _cells(candidates.drawn[field.name][:, start:stop], field)
             counts = (

@@ -288,7 +288,8 @@ class Planner:
         boundary, zeroed = self._with_goal_acceleration(boundary), {}
         for name in self.model.zero_conditions:
             values = getattr(boundary, name)
-            if not np.count_nonzero(values):  # takes a fifth of the time of any()
+            if not np.count_nonzero(values):
+                # Takes a fifth of the time of any().
                 continue
             largest = np.abs(values).max(axis=1)
             row = int(largest.argmax())
@@ -358,7 +359,8 @@ def reuse_previous_plan(
 def _same_goal(old: Boundary, new: Boundary) -> NDArray[np.bool_]:
     pairs = [(old.goal_q, new.goal_q), (old.goal_dq, new.goal_dq)]
     if new.goal_ddq is not None:
-        if old.goal_ddq is None:  # the old motion's goal acceleration was free
+        if old.goal_ddq is None:
+            # The old motion's goal acceleration was free.
             return np.zeros(len(old), bool)
         pairs.append((old.goal_ddq, new.goal_ddq))
     if new.parameters is not None and old.parameters is not None:

@@ -191,7 +191,8 @@ def read_boundary_file(path: Path) -> BoundaryFile:
         names = file.names()
     found = BoundaryFile(path, attributes, columns, has_checksum)
     found.check_shard()
-    if not has_checksum and not found.is_shard:  # files of cnpgen are complete
+    if not has_checksum and not found.is_shard:
+        # Files of cnpgen are complete.
         refuse_misspelt(path, names, ASKED)
     missing = [name for name in ("start_q", "goal_q") if name not in columns]
     if missing:
@@ -216,7 +217,8 @@ def boundary_in(where: str, columns: Mapping[str, NDArray[Any]], n: int) -> Boun
         boundary = boundary_of(n, *map(given.get, CONDITIONS))  # type: ignore[arg-type]
     except UsageError as error:
         raise DatasetError(f"{where}: {error}") from error
-    for name, values in given.items():  # in files, one row does not broadcast to all
+    # in files, one row does not broadcast to all
+    for name, values in given.items():
         width = values.shape[-1] if name == "parameters" else n
         if values.size != len(boundary) * width:
             raise DatasetError(
@@ -390,5 +392,6 @@ def plans_of_rows(
         columns={name: columns[name] for name in kept if name in columns},
         sample_id=columns.get("sample_id"),
         source=source,
-        allow_large_angles=True,  # checked with the file or the tasks
+        # Checked with the file or the tasks.
+        allow_large_angles=True,
     )

@@ -232,9 +232,8 @@ def _refused(
     plans: Plans | JoinedPlans, rate: float, chosen: list[int]
 ) -> dict[int, str]:
     """Return the plans that cannot be sampled: index -> message."""
-    unknown = np.full(
-        len(plans), PlanStatus.UNKNOWN, np.uint8
-    )  # joined plans have only plans that can be evaluated
+    # Joined plans have only plans that can be evaluated.
+    unknown = np.full(len(plans), PlanStatus.UNKNOWN, np.uint8)
     statuses = unknown if isinstance(plans, JoinedPlans) else screen(plans)
     reasons = {
         index: _why_not(plans, index, PlanStatus(statuses[index]), rate)

@@ -41,12 +41,13 @@ PHASE_COLUMN = "path_phase"  # of exported tables: the phase of each sample
 # first.
 GOAL_OPTION = "goal_option"
 
+# For revolute joints.
 UNITS = {
     "q": "rad",
     "dq": "rad/s",
     "ddq": "rad/s^2",
     "jerk": "rad/s^3",
-}  # for revolute joints
+}
 # Similarity ratio of names from which one is treated as a misspelling of the other.
 MIN_SIMILARITY = 0.8
 _DESCRIPTIONS = {

@@ -238,7 +238,8 @@ class PathSplines(Exporter):
         self, path: Path, plans: Iterable[SampledPlan], exported: ExportedSet
     ) -> None:
         """Write the file; see ``Exporter.write``."""
-        del plans  # splines are not sampled in time
+        # Splines are not sampled in time.
+        del plans
         motion = exported.motion
         if motion is None:
             raise UsageError(

@@ -127,7 +127,8 @@ def join_plans(
     found = JoinedPlans(
         (*joined.parts, following), np.concatenate([joined.begins, begins[None]])
     )
-    _ = found.motion  # raises an error for discontinuities
+    # Raises an error for discontinuities.
+    _ = found.motion
     return found
 
 

@@ -291,7 +291,8 @@ def _assembled(
     """Build the plans from the contents of the file."""
     boundary = [columns.pop(name, None) for name in CONDITIONS]
     points = columns.pop("path_control_points")
-    duration = columns.pop("duration", None)  # redundant; r determines it
+    # Redundant; r determines it.
+    duration = columns.pop("duration", None)
     plans = make_plans(
         record,
         Boundary(*boundary),  # type: ignore[arg-type]
@@ -301,7 +302,8 @@ def _assembled(
         sample_id=columns.pop("sample_id", None),
         status=columns.pop("status", None),
         columns=columns,
-        allow_large_angles=True,  # the verdict reports them
+        # The verdict reports them.
+        allow_large_angles=True,
     )
     if duration is not None and duration.shape != (len(plans),):
         raise UsageError(

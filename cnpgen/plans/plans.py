@@ -336,9 +336,10 @@ def _checked(which: Any, plans: int) -> slice | NDArray[Any]:
         raise PlanIndexError(
             f"plans are selected by numbers or a mask: {error}", concerns="which"
         ) from error
+    # An empty list.
     found = (
         found.astype(np.int64) if found.size == 0 and found.dtype.kind == "f" else found
-    )  # an empty list
+    )
     if (
         found.ndim > 1
         or found.dtype.kind not in "biu"

@@ -70,7 +70,8 @@ def _are_usual(robot: Robot, states: Sequence[NDArray[Any]]) -> bool:
     low, high = robot.state_bounds
     width = values.shape[1]
     within = (low[:width] <= values) & (values <= high[:width])
-    return bool(np.count_nonzero(within) == within.size)  # a third of the time of all()
+    # A third of the time of all().
+    return bool(np.count_nonzero(within) == within.size)
 
 
 def _users_level() -> int:

@@ -102,7 +102,8 @@ def load_robot(problem: Problem) -> Robot:
             robot,
             shape=shape,
             held_shape=_held_shape(problem, robot),
-            built_model=robot.model,  # expensive to build again
+            # Expensive to build again.
+            built_model=robot.model,
         )
     if not problem.is_stored:
         _check_sizes(problem, robot)
@@ -341,9 +342,8 @@ def _link_errors(problem: Problem, robot: Robot, reach: float) -> Iterator[str]:
         remedy = _scale_remedy(problem, link)
         yield f"link {link!r}: its collision geometry is {size:.3g} m large, the arm {reach:.3g} m; {remedy}"
     remedy = "remove the scale of its <mesh> elements, or correct it"
-    for link in (
-        _mesh_links(robot.urdf_text) & small.keys() if small else ()
-    ):  # spheres and boxes may be placeholders
+    # Spheres and boxes may be placeholders.
+    for link in _mesh_links(robot.urdf_text) & small.keys() if small else ():
         text = f"its collision geometry is {small[link]:.3g} m large, expected {MIN_MESH_M:g} m or more"
         yield f"link {link!r}: {text}; {remedy}"
     largest = max(size for link, size in sizes.items() if robot.shape.joints[link])

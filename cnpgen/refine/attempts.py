@@ -75,7 +75,8 @@ def _all_attempts(
     else:
         limit = NEARLY_VALID if searches_trees else np.inf
         best = yield from run_levels(refiner, task, x, adjusted, max_violation=limit)
-    if task.stay_within is not None:  # other guesses are other paths
+    if task.stay_within is not None:
+        # Other guesses are other paths.
         return
     if searches_trees:
         best = yield from _best_of(along_tree_paths(refiner, task, best), best)
@@ -142,9 +143,8 @@ def _with_fewer_control_points(
         path, rate = own.unpack(variables)
         yield replace(attempt, x=variables, path=path, rate=rate)
     if task.deadline is not None:
-        task.deadline.max_duration *= (
-            own.nx / fewer.nx
-        ) ** 2  # estimate for steps with all control points
+        # Estimate for steps with all control points.
+        task.deadline.max_duration *= (own.nx / fewer.nx) ** 2
 
 
 def run_levels(
@@ -224,7 +224,8 @@ def _from_other_guesses(
         best = other if other.is_better(best) else best
     last = refiner.time_scaled(task, best, unlimited=True) if task.at_rest else best
     yield refiner.solve(task, refiner.levels.warm, last.variables, Outcome.RESTARTED)
-    if task.at_rest:  # its verdict names the limit that no time scaling meets
+    if task.at_rest:
+        # Its verdict names the limit that no time scaling meets.
         yield last
 
 

@@ -78,9 +78,8 @@ class FineCheck:
             [condition.tolerance_kind == "limit" for condition in conditions],
             [len(condition.g) for condition in conditions],
         )
-        self._speeds = np.flatnonzero(
-            (self._bounds.orders == 1) & ~limits
-        )  # bounded speeds other than those of joints
+        # Bounded speeds other than those of joints.
+        self._speeds = np.flatnonzero((self._bounds.orders == 1) & ~limits)
         self._powers = (
             _powers_of_rate(problem, world, kernels)[self._speeds]
             if len(self._speeds)

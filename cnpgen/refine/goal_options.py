@@ -26,9 +26,8 @@ from cnpgen.refine.refinement import Refinement
 from cnpgen.refine.task import Attempt
 
 Array = NDArray[np.float64]
-Progress = Callable[
-    [int, int], None
-]  # called with plans finished and valid since the last call
+# Called with plans finished and valid since the last call.
+Progress = Callable[[int, int], None]
 
 
 def refine_goal_options(
@@ -130,8 +129,7 @@ def _rounds(
         bound = np.array(
             [lowest.get(int(task), np.inf) for task in plans.sample_id[rows]]
         )
-        waiting = rows[
-            (min_duration[rows] < bound) | np.isinf(bound)
-        ]  # also goals that are not finite
+        # Also goals that are not finite.
+        waiting = rows[(min_duration[rows] < bound) | np.isinf(bound)]
         if len(waiting):
             yield waiting

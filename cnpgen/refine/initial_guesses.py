@@ -66,7 +66,8 @@ def line_through(
 ) -> tuple[Array, Array]:
     """Return ``straight_line``, curved halfway towards a configuration [rad], shape (n,)."""
     interior, rate = straight_line(boundary, velocity_limit, spec)
-    if not len(interior):  # the boundary conditions fix all control points
+    if not len(interior):
+        # The boundary conditions fix all control points.
         return interior, rate
     along = np.linspace(0, 1, len(interior))[:, None]
     parabola = 4 * along * (1 - along)

@@ -156,7 +156,8 @@ def _run(
 ) -> Iterator[dict[int, Attempt]]:
     if not waiting:
         return
-    prepare(plans, options)  # kernels are compiled once, not by every worker
+    # Kernels are compiled once, not by every worker.
+    prepare(plans, options)
     watch.prepared()
     hint = (
         ""

@@ -32,9 +32,8 @@ class Journal:
     """
 
     path: Path  # path of the file
-    finished: dict[
-        int, Attempt
-    ]  # results of earlier runs, index of the plan -> judged attempt
+    # Results of earlier runs, index of the plan -> judged attempt.
+    finished: dict[int, Attempt]
     _file: JournalFile
 
     def append(self, indices: Sequence[int], results: Sequence[Attempt]) -> None:

@@ -129,9 +129,8 @@ class Refiner:
         self.levels = (
             default_grid_levels(problem, self.settings) if levels is None else levels
         )
-        if (
-            self.measures_hulls and levels is None
-        ):  # trees avoid the hulls, so that their paths are nearly valid
+        if self.measures_hulls and levels is None:
+            # Trees avoid the hulls, so that their paths are nearly valid.
             self.levels = replace(self.levels, path=self.levels.warm)
         self._world = world
         self.check = FineCheck(
@@ -409,9 +408,8 @@ class Refiner:
     def tip_path_guesses(self, task: RefinementTask) -> Iterator[Array]:
         """Yield the variables of motions along the initial tip paths of the problem's constraint."""
         constraint = self.problem.scene_constraint
-        width = self.problem.scene_width - len(
-            self.problem.parameters
-        )  # of all values before the parameters
+        # Of all values before the parameters.
+        width = self.problem.scene_width - len(self.problem.parameters)
         values = task.scene.poses[0, pose_width(self.problem.obstacle) : width]
         frame = table_frame_of(self.problem, task.scene.poses[:, width:])
         start = (

@@ -28,15 +28,13 @@ from cnpgen.refine.task import RefinementTask
 from cnpgen.robots.robot import Robot
 
 Array = NDArray[np.float64]
-Follow = Callable[
-    [Array], Array
-]  # states (n, K) of an edge -> the leading valid ones, projected, (n, k)
+# States (n, K) of an edge -> the leading valid ones, projected, (n, k).
+Follow = Callable[[Array], Array]
 
 STATE_SPACING = 0.04  # rad or m, between checked states
 MAX_STATE_SPACING = 0.12  # rad or m, between projected states of one edge
-MAX_TURN = (
-    2 * np.pi
-)  # rad or m, of random configurations from the range between both ends
+# Rad or m, of random configurations from the range between both ends.
+MAX_TURN = 2 * np.pi
 MAX_EXTENSION = 1.0  # rad or m, of a tree towards a random configuration
 STATES_PER_CHECK = 24
 MAX_EXTENSIONS = 1000  # of the trees
@@ -161,7 +159,8 @@ class RestSpace:
         """Return the kernel arguments of K states at rest."""
         (n, count), width = q.shape, self.kernels.values.tape.inputs[0]
         w, orders = np.zeros((width, count)), (width + 1) // (n + 1)
-        w[:n], w[orders * n] = q, 1.0  # positions and the rate
+        # Positions and the rate.
+        w[:n], w[orders * n] = q, 1.0
         return w, np.repeat(self.kernel_poses[:, None], count, axis=1)
 
 
@@ -336,7 +335,8 @@ class TreeSearch:
         """Yield the paths of large trees; of fewer ones if there is no path yet."""
         for number, seed in enumerate(islice(seeds, LARGE_TREES)):
             if number == MAX_UNCONNECTED_TREES and not connected:
-                return  # there is probably no path
+                # There is probably no path.
+                return
             path = self._grow(seed, LARGE_TREE_EXTENSIONS, extension)
             if path is not None:
                 connected = True

@@ -75,7 +75,8 @@ def refine_task(
             or search.continue_rejected(attempt)
         ):
             break
-    if not (search.judged or search.skipped):  # no attempt stays near the input path
+    if not (search.judged or search.skipped):
+        # No attempt stays near the input path.
         search.judged.append(search.judge(next(_input_plans(refiner, task, x))))
     best = search.best()
     for plan in (
@@ -129,7 +130,8 @@ def refine_task_until(
                 break
         late = not verdicts.allows(1)
         cut |= late
-    assert best is not None  # without an input plan the first attempt is judged
+    # Without an input plan the first attempt is judged.
+    assert best is not None
     best = search.explained(best)
     return best.result(search.iterations, Outcome.OUT_OF_TIME if cut else None)
 
@@ -251,9 +253,8 @@ class RefinementSearch:
     task: RefinementTask
     iterations: int = 0  # of all attempts so far
     judged: list[Attempt] = field(default_factory=list)
-    skipped: list[Attempt] = field(
-        default_factory=list
-    )  # with violations above ``MAX_JUDGED_VIOLATION``
+    # With violations above ``MAX_JUDGED_VIOLATION``.
+    skipped: list[Attempt] = field(default_factory=list)
     verdict: Verdict | None = None  # the last one
     # Whether trees searched paths among the obstacles in vain.
     found_no_path: bool = False
@@ -346,9 +347,8 @@ class RefinementSearch:
 
     def judge(self, plan: Attempt) -> Attempt:
         """Return a plan with its verdict."""
-        removable = (
-            self.refiner.measures_hulls and not self._ends_touch
-        )  # contacts, by the solver
+        # Contacts, by the solver.
+        removable = self.refiner.measures_hulls and not self._ends_touch
         judge = self.checker.strict_verdict if removable else self.checker.verdict
         verdict = self.verdict = judge(self.task, plan.path, plan.rate)
         touches = not verdict.valid and verdict.reason in LINK_REASONS

@@ -358,9 +358,8 @@ def _capsule_axes(model: "pin.Model", tip: str) -> tuple[tuple[int, int], ...]:
 
     def straight(a: int, b: int, c: int) -> bool:
         first, second = points[:, b] - points[:, a], points[:, c] - points[:, b]
-        onwards = bool(
-            (first * second).sum(axis=1).min() > 0
-        )  # a link that folds back is a separate segment
+        # A link that folds back is a separate segment.
+        onwards = bool((first * second).sum(axis=1).min() > 0)
         return onwards and bool(np.abs(np.cross(first, second)).max() < 1e-9)
 
     kept = [0]

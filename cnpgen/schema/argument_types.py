@@ -178,9 +178,8 @@ def _check_of(hint: Any, *, strict: bool = False) -> Check | None:
     optional = hint != options[0] and type(None) in get_args(hint)
 
     def check_options(name: str, value: Any) -> Any:
-        if (optional and value is None) or (
-            arrays and type(value) is np.ndarray
-        ):  # the usual case
+        if (optional and value is None) or (arrays and type(value) is np.ndarray):
+            # The usual case.
             return value
         errors = []
         for check in checks:

@@ -116,16 +116,16 @@ def numbers(
             return array
         with np.errstate(over="ignore"):
             real: Array = array.real.astype(dtype, copy=False)
-    except (TypeError, ValueError, RuntimeError) as error:  # the last from torch
+    except (TypeError, ValueError, RuntimeError) as error:
+        # The last from torch.
         uneven = "inhomogeneous" in str(error)
         raise UsageError(
             f"{wrong}: {'its rows have different lengths' if uneven else error}",
             argument=name,
         ) from error
     missing = array.dtype.kind == "O" and any(value is None for value in array.flat)
-    if (
-        array.dtype.kind in "cUSmM" or missing
-    ):  # NumPy would drop imaginary parts and convert texts and None
+    if array.dtype.kind in "cUSmM" or missing:
+        # NumPy would drop imaginary parts and convert texts and None
         raise UsageError(f"{wrong}: {array.dtype} is no real type", argument=name)
     return real
 
@@ -155,7 +155,8 @@ def distinct(*values: float, digits: int = 6) -> tuple[str, ...]:
     different = len({float(value) for value in values if not math.isnan(value)})
     different += any(math.isnan(value) for value in values)
     texts = tuple(f"{value:.{digits}g}" for value in values)
-    while len(set(texts)) < different:  # 17 digits distinguish all floats
+    while len(set(texts)) < different:
+        # 17 digits distinguish all floats
         digits += 1
         texts = tuple(f"{value:.{digits}g}" for value in values)
     return texts

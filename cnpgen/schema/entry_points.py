@@ -52,7 +52,8 @@ def entry_points() -> Mapping[str, tuple[EntryPoint, ...]]:
     known: set[str] = set()
     for file in _metadata_files():
         key = file.parent.name.partition("-")[0].lower()
-        if key in known:  # the first one on the path hides the others
+        if key in known:
+            # The first one on the path hides the others.
             continue
         known.add(key)
         text = file.read_text(encoding="utf-8")

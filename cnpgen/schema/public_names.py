@@ -33,9 +33,8 @@ def lazy_exports(
         if name in modules:
             with import_errors_with_hint():
                 value = getattr(import_module(modules[name]), name)
-        elif name.startswith(
-            "_"
-        ):  # tools look up special names, for which the metadata need not be read
+        elif name.startswith("_"):
+            # Tools look up special names, for which the metadata need not be read.
             raise AttributeError(f"module {package!r} has no attribute {name!r}")
         else:
             value = _load_of_addon(package, name)

@@ -110,9 +110,8 @@ BUILT_IN: dict[str, dict[str, str]] = {
     },
 }
 
-RENAMED = {
-    "cnpgen.planners": {"cnp-b": "cnpgen", "cnp-b+refine": "cnpgen+refine"}
-}  # group -> old name -> new name
+# Group -> old name -> new name.
+RENAMED = {"cnpgen.planners": {"cnp-b": "cnpgen", "cnp-b+refine": "cnpgen+refine"}}
 
 
 def names(group: str) -> tuple[str, ...]:
@@ -150,7 +149,8 @@ def load(group: str, name: str, base: type[Any] | None = None) -> type[Any]:
         kind: type[Any] = importer()
     except MissingAddonError:
         raise
-    except Exception as error:  # imported modules may raise any exception
+    except Exception as error:
+        # Imported modules may raise any exception.
         raise RecipeError(
             [f"{what} cannot be imported: {type(error).__name__}: {error}"]
         ) from error
@@ -220,9 +220,8 @@ def package_digest(package: str) -> str:
     Empty if it has none.
     """
     module = sys.modules.get(package)
-    folders = [
-        Path(folder) for folder in getattr(module, "__path__", ())
-    ]  # a namespace package has several
+    # A namespace package has several.
+    folders = [Path(folder) for folder in getattr(module, "__path__", ())]
     source = getattr(module, "__file__", None)
     files = [file for folder in folders for file in sorted(folder.rglob("*.py"))]
     if not folders and source:

@@ -202,7 +202,8 @@ def _finite(number: Decimal | float, suffix: str, value: object, unit: str) -> f
         raise ValueError(
             f"expected {dimension(unit)} that is finite, got {show(value)}"
         )
-    return result + 0.0  # no negative zero: "-0" and "0" are the same recipe
+    # No negative zero: "-0" and "0" are the same recipe.
+    return result + 0.0
 
 
 def _factor(written: str, value: object, unit: str) -> Decimal:

@@ -224,15 +224,16 @@ def check_shard(
             *findings,
             *(Finding(name, OUTSIDE, hint=COPY_HINT) for name in outside),
         ]
-    if (
-        expected is None
-    ):  # neither manifest nor sidecar is valid, which is a finding already
+    if expected is None:
+        # Neither manifest nor sidecar is valid, which is a finding already.
         return findings
     damage = _check_file(folder, task.file, *expected)
     if damage and not _is_of_another_spec(path, spec.version_with(task)):
-        return findings + damage  # HDF5 may hang on a damaged file
+        # HDF5 may hang on a damaged file
+        return findings + damage
     content = check_content(folder, spec, task)
-    if findings or damage:  # make-dataset detects and replaces such a shard
+    if findings or damage:
+        # Make-dataset detects and replaces such a shard.
         content = [replace(finding, hint=REMAKE_HINT) for finding in content]
     return findings + damage + content
 
@@ -310,7 +311,8 @@ def check_content(folder: Path, spec: DatasetSpec, task: ShardTask) -> list[Find
         for name, expected in expected_scenes.items()
         if name in schema and schema[name].attributes != expected
     ]
-    if not problems:  # the description is that of the specification
+    if not problems:
+        # The description is that of the specification.
         try:
             read_rows(Shard(folder, spec, task))
         except DatasetError as error:

@@ -170,7 +170,8 @@ def read_columns(
             columns[name] = np.empty(place.shape, place.dtype)
             file.seek(place.offset or 0)
             buffer = columns[name].data.cast("B")
-            while buffer:  # the system reads at most 2 GiB at once
+            while buffer:
+                # The system reads at most 2 GiB at once.
                 if not (count := file.readinto(buffer)):
                     raise DatasetError(
                         f"{shard.path} was cut off while it was read; {RERUN_HINT}"

@@ -186,12 +186,13 @@ class DatasetSpec:
     scene_families: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
+        # Equal to what is read from JSON.
         for name in (
             "recipe",
             "splits",
             "robot",
             "versions",
-        ):  # equal to what is read from JSON
+        ):
             object.__setattr__(self, name, plain(getattr(self, name)))
         object.__setattr__(
             self, "previous_splits", tuple(map(plain, self.previous_splits))
@@ -423,13 +424,13 @@ def shard_attributes(spec: DatasetSpec, task: ShardTask) -> dict[str, str | int]
 def to_json(spec: DatasetSpec) -> dict[str, Any]:
     """Return a specification as a JSON-able dict."""
     converted = {
-        "seed": str(spec.seed),  # JSON numbers of other readers have 53 bits
+        # JSON numbers of other readers have 53 bits
+        "seed": str(spec.seed),
         "fields": plain([asdict(item) for item in spec.fields]),
         "previous_splits": plain(spec.previous_splits),
     }
-    if (
-        spec.scene_obstacles
-    ):  # absent in specifications without scenes, whose fingerprints stay the same
+    if spec.scene_obstacles:
+        # Absent in specifications without scenes, whose fingerprints stay the same.
         converted |= {name: plain(getattr(spec, name)) for name in _SCENE_KEYS}
     names = [
         name

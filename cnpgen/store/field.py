@@ -36,10 +36,11 @@ class Field:
     dtype: str = "float"
 
     def __post_init__(self) -> None:
+        # Floats, as read from JSON, because they are part of the fingerprint.
         for name in (
             "valid_min",
             "valid_max",
-        ):  # floats, as read from JSON, because they are part of the fingerprint
+        ):
             limits = getattr(self, name)
             if limits is not None:
                 object.__setattr__(self, name, tuple(map(float, limits)))

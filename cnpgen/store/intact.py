@@ -25,9 +25,8 @@ def leads_outside(path: Path, folder: Path | None = None) -> bool:
     folder = path.parents[1] if folder is None else folder
     if not (path.is_symlink() or (path.parent != folder and path.parent.is_symlink())):
         return False
-    return not Path(os.path.realpath(path)).is_relative_to(
-        os.path.realpath(folder)
-    )  # resolve() refuses circular links
+    # resolve() refuses circular links
+    return not Path(os.path.realpath(path)).is_relative_to(os.path.realpath(folder))
 
 
 def outside_links(folder: Path, names: Iterable[str] = (*DOCUMENTS, WORK)) -> list[str]:

@@ -70,7 +70,8 @@ def finalize(
     manifest = _manifest(folder, summary, created=created)
     save_document(folder / MANIFEST, manifest)
     remove_all_temporary(folder / WORK)
-    with suppress(OSError):  # other files in it are kept
+    # Other files in it are kept.
+    with suppress(OSError):
         (folder / WORK).rmdir()
     return cast(dict[str, Any], plain(manifest))
 

@@ -40,7 +40,8 @@ def require_dataset(folder: str | Path, *, argument: str = "folder") -> Path:
     folder = require_folder(folder, argument=argument)
     if is_dataset(folder):
         return folder
-    recipe = folder / "dataset.toml"  # as of 'cnpgen copy'
+    # As of 'cnpgen copy'.
+    recipe = folder / "dataset.toml"
     hint = f": 'cnpgen make-dataset {recipe}' makes one" if recipe.is_file() else ""
     raise UsageError(
         f"{folder} is not a dataset of cnpgen: it has no {SPECIFICATION}{hint}",
@@ -87,7 +88,8 @@ def require_path(path: Path, expected: str, *, argument: str = "path") -> None:
     check_readable(path)
     try:
         present = path.exists()
-    except (OSError, ValueError) as error:  # a name that is too long, or with NUL
+    except (OSError, ValueError) as error:
+        # A name that is too long, or with NUL.
         reason = getattr(error, "strerror", None) or str(error)
         raise UsageError(
             f"{str(path)!r:.100} cannot be a path: {reason}, expected {expected}",
@@ -112,7 +114,8 @@ def similar_path(path: Path, names: Iterable[str] = ()) -> str:
                 if path.suffix in ("", each.suffix) or each.is_dir()
             ),
         ]
-    others = [name for name in names if name != path.name]  # a link may lead nowhere
+    # A link may lead nowhere.
+    others = [name for name in names if name != path.name]
     return nearest(path.name, others, similarity=MIN_SIMILARITY)
 
 
@@ -121,7 +124,8 @@ def file_kind(path: Path) -> str:
 
     Empty if it is not known.
     """
-    if not path.is_file():  # opening a pipe would block
+    if not path.is_file():
+        # Opening a pipe would block.
         return ""
     try:
         with path.open("rb") as file:

@@ -164,7 +164,8 @@ def commit_shard(
     scenes, too; others raise DatasetError. Other arguments become attributes of the
     record.
     """
-    if is_committed(folder, spec, task):  # another process made the same shard
+    if is_committed(folder, spec, task):
+        # Another process made the same shard.
         return load_record(folder, task)
     if scenes is not None:
         check_scenes(
@@ -196,9 +197,8 @@ def commit_shard(
             seconds=seconds,
             versions=versions or {},
         )
-        if not is_committed(
-            folder, spec, task
-        ):  # otherwise another process may already have summarized its record
+        if not is_committed(folder, spec, task):
+            # Otherwise another process may already have summarized its record.
             save_record(folder, task, record)
             return record
     except CnpgenError:

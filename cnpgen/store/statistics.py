@@ -203,9 +203,8 @@ def _histogram(columns: Floats, low: Floats, high: Floats) -> NDArray[np.int64]:
     """Count the rows of every column, shape (c, rows), in its bins, shape (c, 64)."""
     width = np.where(high > low, high - low, 1.0)
     positions = (columns - low[:, None]) / width[:, None] * N_BINS
-    bins = np.clip(positions, 0, N_BINS - 1).astype(
-        np.int64
-    )  # rounds down, since no position is negative
+    # Rounds down, since no position is negative.
+    bins = np.clip(positions, 0, N_BINS - 1).astype(np.int64)
     return np.array([np.bincount(row, minlength=N_BINS) for row in bins])
 
 

@@ -43,9 +43,8 @@ class Workspace:
 
     folder: Path  # the folder
     existing: Path  # the folder, or its nearest existing parent
-    content: Literal[
-        "nothing", "a dataset", "a file", "something else"
-    ]  # a file is in place of the folder
+    # A file is in place of the folder.
+    content: Literal["nothing", "a dataset", "a file", "something else"]
     has_shards: bool = False  # whether there are shards or sidecars
     # The specification in it; None where there is none that can be read.
     spec: DatasetSpec | None = None
@@ -167,7 +166,8 @@ def is_dataset(folder: Path) -> bool:
 
 def _is_cnpgen_document(path: Path) -> bool:
     try:
-        if not path.is_file():  # opening a pipe would block
+        if not path.is_file():
+            # Opening a pipe would block.
             return False
         with path.open("rb") as file:
             return _FORMAT_KEY.match(file.read(64)) is not None
@@ -232,9 +232,8 @@ def _cleared(workspace: Workspace) -> Workspace:
         return workspace
     folder, splits = workspace.folder, check_clearable(workspace)
     with machine_errors("delete from", folder):
-        (folder / MANIFEST).unlink(
-            missing_ok=True
-        )  # first: a partially deleted dataset must not appear complete
+        # First: a partially deleted dataset must not appear complete.
+        (folder / MANIFEST).unlink(missing_ok=True)
         for split in splits:
             for path in split.iterdir():
                 path.unlink()

@@ -15,9 +15,8 @@ from numpy.typing import NDArray
 Array = NDArray[Any]
 
 BETA_1, BETA_2, EPSILON = 0.9, 0.999, 1e-8
-PARAMETERS_PER_BLOCK = (
-    1 << 17
-)  # small enough for the five arrays of a block to stay in the CPU cache
+# Small enough for the five arrays of a block to stay in the CPU cache.
+PARAMETERS_PER_BLOCK = 1 << 17
 SAMPLE_MEMORY, BATCH_MEMORY = 0.98, 0.99
 # Of a batch's norm to the running norm, in the update of the latter.
 MAX_NORM_RATIO = 3.0

@@ -291,7 +291,8 @@ def _loss(loaded: LoadedProblem, settings: TrainingSettings) -> PlanLoss:
         margins=margins,
         dtype=settings.precision,
     )
-    loss.load_kernels()  # outside the timed steps
+    # Outside the timed steps.
+    loss.load_kernels()
     return loss
 
 

@@ -57,7 +57,8 @@ def with_via_points(
                 "via points are for problems that place their obstacles",
                 concerns="model",
             )
-        placeholder = (tuple(loaded.robot.home.tolist()),)  # its value is not used
+        # Its value is not used.
+        placeholder = (tuple(loaded.robot.home.tolist()),)
         config = replace(model.config, via_points=placeholder)
         inference = make_inference_pipeline(
             loaded, config, scale_time=False, fixed_at_goal=model.fixed_at_goal

@@ -73,9 +73,8 @@ def prepare_rows(
         slice(first, first + PREPARED_ROWS_PER_BLOCK)
         for first in range(0, max(len(boundary), 1), PREPARED_ROWS_PER_BLOCK)
     ]
-    straight = replace(
-        prepare, line=None
-    )  # features do not depend on the projected line, which takes most of the time
+    # Features do not depend on the projected line, which takes most of the time.
+    straight = replace(prepare, line=None)
     placed = bool(prepare.placed)
     poses = [None if obstacle_poses is None else obstacle_poses[part] for part in parts]
     definition = features or fit_features(
@@ -116,7 +115,8 @@ def _arrays(tasks: Tasks, features: Features, dtype: str) -> dict[str, Array]:
         for name, values in vars(tasks).items()
         if isinstance(values, np.ndarray)
     }
-    parts.pop("observation", None)  # it is part of the features
+    # It is part of the features.
+    parts.pop("observation", None)
     parts |= {} if tasks.placed is None else {"placed": tasks.placed.poses}
     return (
         arrays

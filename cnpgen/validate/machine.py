@@ -225,7 +225,8 @@ def _check_cores(findings: _Findings) -> tuple[int, int]:
     try:
         from joblib import cpu_count
 
-        granted = int(cpu_count())  # respects the limits of containers
+        # Respects the limits of containers.
+        granted = int(cpu_count())
     except Exception:  # noqa: BLE001 - reported by _check_libraries
         granted = available
     if granted < available:
@@ -317,7 +318,8 @@ def _check_backend(findings: _Findings, cache: str) -> tuple[str, str, bool]:
         return "", text, False
     findings.notes += [str(warning.message) for warning in caught]
     if str(folder) != cache:
-        shutil.rmtree(folder, ignore_errors=True)  # a temporary folder of this check
+        # A temporary folder of this check.
+        shutil.rmtree(folder, ignore_errors=True)
     reason = (
         "a test kernel was generated and is correct"
         if backend == "compiled"
@@ -330,9 +332,8 @@ def _check_cache(findings: _Findings, cache: str) -> bool:
     """Return whether cached kernels may be loaded, and note those that may not."""
     from cnpgen.store.files.cache_folder import trust_problem, untrusted_files
 
-    if (
-        not cache or not Path(cache).is_dir() or trust_problem(Path(cache))
-    ):  # noted by the choice of the backend
+    if not cache or not Path(cache).is_dir() or trust_problem(Path(cache)):
+        # Noted by the choice of the backend.
         return False
     if files := untrusted_files(Path(cache)):
         findings.notes.append(

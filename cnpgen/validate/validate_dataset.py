@@ -62,9 +62,8 @@ def regenerate_blocks(
     size = spec.block_rows
     blocks = [(task, block) for task in tasks for block in blocks_of(task, size)]
     backend, cache_folder = backend_of(folder, spec)
-    dataset = StoredDataset(
-        folder, spec, None
-    )  # without the manifest, which may be damaged
+    # Without the manifest, which may be damaged.
+    dataset = StoredDataset(folder, spec, None)
     chosen = np.random.default_rng().permutation(len(blocks))[:count]
     identical, findings = 0, []
     with restored(spec) as recipe:
@@ -139,9 +138,8 @@ def _explanation(spec: DatasetSpec, recipe: DatasetRecipe) -> str:
         changed.append(
             f"revision of the generator {spec.revision} -> {GENERATOR_REVISION}"
         )
-    if (
-        recipe_digest(recipe) != spec.recipe_sha256
-    ):  # the recipe is that of the dataset, so only code can differ
+    if recipe_digest(recipe) != spec.recipe_sha256:
+        # The recipe is that of the dataset, so only code can differ.
         changed.append("the code of its plug-ins has changed")
     return f" (made with other versions: {', '.join(changed)})" if changed else ""
 
@@ -278,9 +276,8 @@ def validate_dataset(
         spec = load_dataset_spec(folder)
     except DatasetError:
         return ValidationReport(folder, 0, tuple(findings))
-    if (
-        regenerate
-    ):  # missing packages and backends are reported before the expensive checks
+    if regenerate:
+        # Missing packages and backends are reported before the expensive checks.
         backend_of(folder, spec)
     if deep or regenerate:
         with restored(spec):
@@ -336,7 +333,8 @@ def check_statistics(folder: Path, spec: DatasetSpec) -> list[Finding]:
     try:
         document = load_stats_document(folder)
         expected = plain(stats_document(summarize_dataset(folder, spec)))
-    except DatasetError:  # missing or damaged files are findings already
+    except DatasetError:
+        # Missing or damaged files are findings already.
         return []
     different = [key for key in expected if document.get(key) != expected[key]]
     text = f"is not the summary of the records of the shards: {', '.join(different)} differ"

@@ -164,9 +164,8 @@ def _check_speed_fractions(spec: DatasetSpec, checks: list[_ShardCheck]) -> list
         np.concatenate([getattr(check, name) for check in checks])
         for name in ("fractions", "goals")
     )
-    _, unique = np.unique(
-        goals, return_index=True
-    )  # several starts may have the same goal
+    # Several starts may have the same goal.
+    _, unique = np.unique(goals, return_index=True)
     count, fraction = repeated_fraction(fractions[unique], spec.dtype)
     text = f"{counted(count, 'hit')} with the same fraction of their maximum speed, {fraction:.6g}"
     return (
@@ -182,9 +181,8 @@ def row_keys(values: NDArray[Any]) -> NDArray[np.uint64]:
     Equal rows have equal keys.
     """
     bits = np.ascontiguousarray(values, np.float64).view(np.uint64)
-    bits = bits ^ (
-        bits >> np.uint64(32)
-    )  # float32 values have zero low bits, which products would not mix
+    # float32 values have zero low bits, which products would not mix
+    bits = bits ^ (bits >> np.uint64(32))
     bits *= np.resize(_ODD_MULTIPLIERS, bits.shape[1])
     bits ^= bits >> np.uint64(29)
     return np.asarray(

@@ -186,7 +186,8 @@ class RobotWorld(ABC, Generic[Value]):
             self._poses, copied = None, poses.copy()
             self._solids = solids_of(self.obstacles, copied)
             self._collisions.place(self._solids)
-            self._poses = copied  # last: after an error the obstacles are placed again
+            # Last: after an error the obstacles are placed again.
+            self._poses = copied
         self.parameters.set(values)
 
     def _pairs_of(self, bodies: str) -> PairDistances:
@@ -242,9 +243,8 @@ class World(RobotWorld[float]):
     """
 
     def _start(self) -> None:
-        self._dynamics_data = (
-            self._model.createData()
-        )  # separate: RNEA's accelerations include gravity
+        # Separate: RNEA's accelerations include gravity.
+        self._dynamics_data = self._model.createData()
         self._joints = sorted(
             {point for segment in self.robot.capsule_axes for point in segment}
             - {self.robot.n}
@@ -331,9 +331,8 @@ class World(RobotWorld[float]):
         jacobian = pin.computeFrameJacobian(
             self._model, self._dynamics_data, self.q, self._tip, frame
         )
-        return np.array(jacobian).reshape(6, -1)[
-            :3
-        ]  # Pinocchio returns a single column as a vector
+        # Pinocchio returns a single column as a vector
+        return np.array(jacobian).reshape(6, -1)[:3]
 
     @property
     def tip_acceleration(self) -> Array:
@@ -359,7 +358,8 @@ class World(RobotWorld[float]):
 
     @cached_property
     def _segment_distances(self) -> list[float]:
-        poses = self._data.oMi  # of the universe and joints 1 to n
+        # Of the universe and joints 1 to n.
+        poses = self._data.oMi
         points = {
             joint: poses[joint + 1].translation.tolist() for joint in self._joints
         }

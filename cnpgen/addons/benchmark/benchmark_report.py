@@ -232,7 +232,8 @@ def _motions(benchmark: Benchmark, *, video: bool) -> list[str]:
             element, caption = _render(task, plant, video=video)
         except MachineError as error:
             return [f"<p>No images: {escape(str(error))}</p>"]
-        except CnpgenError as error:  # the line is damaged
+        except CnpgenError as error:
+            # The line is damaged.
             parts.append(f"<p>{label}: no image: {escape(str(error))}</p>")
             continue
         parts.append(

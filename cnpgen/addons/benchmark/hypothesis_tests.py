@@ -77,7 +77,8 @@ def values_of(
     ):
         return {}
     values: Values = {"planned": has_answer}
-    if row.get("ending") != CRASHED:  # the CPU time of a crashed process is unknown
+    if row.get("ending") != CRASHED:
+        # The CPU time of a crashed process is unknown.
         values |= {
             "planning_ms": 1e3 * row["planning_s"],
             "planning_cpu_ms": 1e3 * row["planning_cpu_s"],

@@ -120,7 +120,8 @@ class PlannerProcess:
             program = f"import sys; sys.path[:] = {sys.path!r}; from {__name__} import serve; "
             program += f"serve({child_end.fileno()})"
             command = [sys.executable, "-c", program]
-            self._process = subprocess.Popen(  # output of planners is not data
+            # Output of planners is not data.
+            self._process = subprocess.Popen(
                 command,
                 pass_fds=[child_end.fileno()],
                 stdin=subprocess.DEVNULL,
@@ -155,9 +156,8 @@ def end_processes(root: int) -> None:
     import psutil
 
     with suppress(psutil.NoSuchProcess):
-        descendants = psutil.Process(root).children(
-            recursive=True
-        )  # also those with a session of their own
+        # Also those with a session of their own.
+        descendants = psutil.Process(root).children(recursive=True)
         with suppress(ProcessLookupError):
             os.killpg(root, signal.SIGKILL)
         for process in descendants:
@@ -178,9 +178,8 @@ def cpu_time_of(root: int) -> float:
         process = psutil.Process(root)
         for part in (process, *process.children(recursive=True)):
             with suppress(psutil.NoSuchProcess):
-                seconds += sum(
-                    part.cpu_times()[:4]
-                )  # user, system, and those of ended child processes
+                # User, system, and those of ended child processes.
+                seconds += sum(part.cpu_times()[:4])
     return seconds
 
 
@@ -192,9 +191,8 @@ def _cpu_time() -> float:
 
 def serve(descriptor: int) -> None:
     """Prepare the planner whose name arrives on a pipe, then plan until the pipe is closed."""
-    signal.signal(
-        signal.SIGINT, signal.SIG_IGN
-    )  # a terminal sends it to all processes; the parent decides
+    # A terminal sends it to all processes; the parent decides.
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
     with Connection(descriptor) as pipe, suppress(EOFError, OSError):
         name, setting = pipe.recv()
         try:

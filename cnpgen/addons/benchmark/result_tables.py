@@ -20,9 +20,8 @@ from cnpgen.schema.argument_types import checked_arguments
 from cnpgen.store.files.atomic import write_file
 
 PAPER_PLANNER = "cnp-b-paper"  # the planner that the paper calls CNP-B
-PRINTED: dict[
-    str, dict[str, dict[str, str]]
-] = {  # suite -> planner -> figure -> value in the paper's text
+# Suite -> planner -> figure -> value in the paper's text.
+PRINTED: dict[str, dict[str, dict[str, str]]] = {
     "hits-81": {
         PAPER_PLANNER: {"scored": "100 %", "planning_ms": "33", "z_error_mm_s": "< 5"},
         "aqp": {"scored": "92.59 %", "planning_ms": "42 in C++"},

@@ -71,7 +71,8 @@ class Results:
     def append(self, row: dict[str, Any]) -> None:
         """Append a line to the file and to the rows."""
         text = json.dumps(row, allow_nan=False)
-        self._merge(json.loads(text))  # equal to the row that a later run reads
+        # Equal to the row that a later run reads.
+        self._merge(json.loads(text))
         append_line(self.path, text)
 
     def missing(self, count: int) -> Iterator[int]:
@@ -171,7 +172,8 @@ def _check_row(row: Any) -> None:
             check_structure(answer, structure)
             check_structure(row, {"verdict": _VERDICT})
             for name in structure.keys() - {"degree"}:
-                np.array(answer[name], float)  # rows of equal length
+                # Rows of equal length.
+                np.array(answer[name], float)
     if "executed" in row:
         check_structure(row, {"executed": {ANY_KEY: {ANY_KEY: ANYTHING}}})
         for executed in row["executed"].values():
@@ -241,7 +243,8 @@ def answer_from_dict(problem: Plans, content: dict[str, Any]) -> Plans | Traject
         degree=content["degree"],
         columns=problem.columns,
         sample_id=problem.sample_id,
-        allow_large_angles=True,  # as in the problem
+        # As in the problem.
+        allow_large_angles=True,
     )
 
 

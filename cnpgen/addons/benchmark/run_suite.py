@@ -280,10 +280,10 @@ def _checked_planners(
 def _checked_parameters(planner: str, parameters: Mapping[str, Any]) -> dict[str, Any]:
     """Return the values of all fields of a planner."""
     try:
-        loaded: Any = load_planner(
-            planner, parameters
-        )  # a dataclass, as its contract requires
-    except RecipeError:  # it cannot be imported; its own process reports the error
+        # A dataclass, as its contract requires.
+        loaded: Any = load_planner(planner, parameters)
+    except RecipeError:
+        # It cannot be imported; its own process reports the error.
         return {}
     return dict(plain(asdict(loaded)))
 
@@ -341,9 +341,8 @@ def _row(index: int, problem: Plans, outcome: PlanningOutcome) -> dict[str, Any]
         "error": outcome.error,
         "answer": outcome.answer,
     }
-    if (
-        outcome.answer is not None
-    ):  # with the boundary conditions of the problem, not those of the answer
+    if outcome.answer is not None:
+        # With the boundary conditions of the problem, not those of the answer.
         row["verdict"] = verdict_to_dict(
             judge_answer(problem, answer_from_dict(problem, outcome.answer))
         )

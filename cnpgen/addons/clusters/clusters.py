@@ -140,7 +140,8 @@ class _Dask(Cluster):
         lost: tuple[type[BaseException], ...] = (OSError, ValueError, *_lost_of_dask())
         try:
             return sum(self._client.nthreads().values())
-        except lost as error:  # includes time-outs and closed connections
+        except lost as error:
+            # Includes time-outs and closed connections.
             raise MachineError(
                 f"the connection to {self._name} is lost: {error}"
             ) from error
@@ -172,7 +173,8 @@ class _Dask(Cluster):
             raise MachineError(f"the connection to {self._name} is lost") from error
 
     def cancel(self, tickets: Sequence[Any]) -> None:
-        with suppress(Exception):  # errors of a cancellation are irrelevant
+        # Errors of a cancellation are irrelevant.
+        with suppress(Exception):
             self._client.cancel(tickets)
 
 
@@ -227,7 +229,8 @@ class _Ray(Cluster):
         import ray
 
         for ticket in tickets:
-            with suppress(Exception):  # errors of a cancellation are irrelevant
+            # Errors of a cancellation are irrelevant.
+            with suppress(Exception):
                 ray.cancel(ticket)
 
 
@@ -275,9 +278,8 @@ def _dask(address: str | None, workers: int | None, what: str) -> Iterator[Clust
                     address, set_as_default=False, timeout=CONNECTION_TIMEOUT_S
                 )
             else:
-                with (
-                    signals_blocked()
-                ):  # local workers do not receive the Ctrl-C of a terminal
+                # Local workers do not receive the Ctrl-C of a terminal.
+                with signals_blocked():
                     cluster = _local_dask(workers)
                     client = Client(
                         cluster, set_as_default=False, security=cluster.security
@@ -288,7 +290,8 @@ def _dask(address: str | None, workers: int | None, what: str) -> Iterator[Clust
             TypeError,
             RuntimeError,
             MemoryError,
-        ) as error:  # memory: of a foreign answer
+        ) as error:
+            # Memory: of a foreign answer.
             raise MachineError(
                 f"cannot reach {what}: {str(error) or 'it is no scheduler'}"
             ) from error
@@ -297,7 +300,8 @@ def _dask(address: str | None, workers: int | None, what: str) -> Iterator[Clust
         finally:
             for part in (client, cluster):
                 if part is not None:
-                    with suppress(OSError, RuntimeError):  # the scheduler is gone
+                    # The scheduler is gone.
+                    with suppress(OSError, RuntimeError):
                         part.close(timeout=CLOSING_TIMEOUT_S)
 
 
@@ -309,9 +313,8 @@ def _local_dask(workers: int | None) -> Any:
     with requires_extra("dask", "cryptography"):
         security = Security.temporary()
     config = importlib.import_module("dask.config")
-    with config.set(
-        {"distributed.scheduler.http.routes": []}
-    ):  # its HTTP server has no authentication
+    # Its HTTP server has no authentication.
+    with config.set({"distributed.scheduler.http.routes": []}):
         return LocalCluster(
             n_workers=workers,
             threads_per_worker=1,
@@ -320,7 +323,8 @@ def _local_dask(workers: int | None) -> Any:
             security=security,
             dashboard_address=f"{LOOPBACK}:0",
             scheduler_kwargs={"dashboard": False},
-            silence_logs=logging.CRITICAL,  # terminated workers log irrelevant errors
+            # Terminated workers log irrelevant errors.
+            silence_logs=logging.CRITICAL,
         )
 
 

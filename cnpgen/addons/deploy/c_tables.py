@@ -96,7 +96,8 @@ def amounts(parts: PlannerParts) -> dict[str, float]:
     """Return the real constants of the C file by name."""
     values = {
         "PATH_SCALE": float(parts.model.config.path_scale),
-        "MAX_POSITION": 1e6,  # rad, and rates below in 1/s: larger ones are no motions
+        # Rad, and rates below in 1/s: larger ones are no motions.
+        "MAX_POSITION": 1e6,
         "MIN_RATE": 1e-6,
         "MAX_RATE": 1e6,
     }

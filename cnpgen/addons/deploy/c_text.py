@@ -10,9 +10,8 @@ from numpy.typing import NDArray
 MAX_PREFIX_LENGTH = 40  # compilers distinguish 63 characters, with suffixes
 FALLBACK_NAME = "planner"
 NUMBERS_PER_LINE = 10
-_SAFE_IN_COMMENT = re.compile(
-    r"[^A-Za-z0-9 _.,:;()+=<>%@#|~^-]"
-)  # without / * \ ? and quotes
+# Without / * \ ? and quotes.
+_SAFE_IN_COMMENT = re.compile(r"[^A-Za-z0-9 _.,:;()+=<>%@#|~^-]")
 
 
 def identifier(text: str) -> str:

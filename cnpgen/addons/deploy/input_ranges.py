@@ -66,10 +66,12 @@ def input_ranges(
 
 def _substitute(model: Model) -> InputRanges:
     """Return ranges from the standardization, if that is of the model's own rows."""
-    if not model.features.mean.any():  # preset "paper": states in units of the limits
+    if not model.features.mean.any():
+        # Preset "paper": states in units of the limits.
         limit = 1 + ROUNDING_TOLERANCE
         source = f"positions within pi, velocities and accelerations within the limits, {_NO_RANGES}"
-    elif model.training.get("start_from"):  # its features are those of other rows
+    elif model.training.get("start_from"):
+        # Its features are those of other rows.
         limit = _UNLIMITED
         source = f"unknown, {_NO_RANGES}: no input is refused as outside of it"
     else:

@@ -13,10 +13,11 @@ _EXPRESSIONS = {  # of one operand or two
     "LT": "vlt({},{})", "LE": "vle({},{})", "EQ": "veq({},{})", "NE": "vne({},{})", "AND": "vand({},{})",
     "OR": "vor({},{})", "IF_ELSE_ZERO": "vsel({},{})",
 }  # fmt: skip
+# One instruction if the second is not nan.
 _WITHOUT_NAN = {
     "FMIN": "lesser({},{})",
     "FMAX": "larger({},{})",
-}  # one instruction if the second is not nan
+}
 
 
 def statements(

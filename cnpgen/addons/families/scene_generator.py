@@ -163,9 +163,8 @@ def _check_no_manifold(problem: Problem, robot: Robot) -> None:
     world.set_state(
         robot.home, rest, rest, scene_of(problem, zero, zero, zero).poses[0]
     )
-    for constraint in (
-        problem.constraint if robot.shape is not None else ()
-    ):  # the lack of a shape is reported later
+    # The lack of a shape is reported later.
+    for constraint in problem.constraint if robot.shape is not None else ():
         if any(
             condition.g and condition.is_equality
             for condition in constraint.measured(world)
@@ -201,7 +200,8 @@ class _Generator:
         )
         try:
             scene = checked_scene(scene)
-        except SceneError:  # an obstacle contains the base
+        except SceneError:
+            # An obstacle contains the base.
             return
         states = RestingStates(self.problem, self.robot, scene.obstacles)
         grasps = self._grasp_states(states, layout, random)

@@ -94,7 +94,8 @@ class TablePick(SceneFamily):
         place_objects(
             random, table, (0.08, 0.47, -0.37, 0.37), 0.0, objects, from_above=True
         )
-        for obstacle in list(table.obstacles[1:]):  # low places beside the objects
+        # Low places beside the objects.
+        for obstacle in list(table.obstacles[1:]):
             x, y, _ = obstacle.position or (0.0, 0.0, 0.0)
             dx, dy = x - table.origin[0], y - table.origin[1]
             cos, sin = math.cos(table.yaw), math.sin(table.yaw)

@@ -29,9 +29,10 @@ with requires_extra("jax", "jax"):
     import jax.numpy as jnp
 
     for _kind in (Tasks, Boundary):
+        # for arguments of jit
         jax.tree_util.register_dataclass(
             _kind, [field.name for field in fields(_kind)], []
-        )  # for arguments of jit
+        )
     jax.tree_util.register_dataclass(Scene, ["poses"], ["obstacles"])
 
 __all__ = ["control_points", "plan_loss", "to_jax"]

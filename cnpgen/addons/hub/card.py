@@ -107,9 +107,8 @@ def card_text(
         .replace("CNPGEN", f"hf://datasets/{folder}@main" if shards else folder)
     )
     split = next(iter(summary.statistics))
-    files = (
-        "" if spec.scene_obstacles else "{}/*.h5"
-    )  # Hugging Face reads equally many rows of all arrays only
+    # Hugging Face reads equally many rows of all arrays only
+    files = "" if spec.scene_obstacles else "{}/*.h5"
     sections = [
         _front_matter(summary, f"{PARQUET}/{{}}/*.parquet" if shards else files),
         f"# {spec.name} {spec.version}\n\n{spec.title or spec.name}\n\n{_contents(summary)}",
@@ -133,7 +132,8 @@ def card_text(
 def card_notes(card: str) -> str:
     """Return the notes in a card of ``card_text``; empty if there are none."""
     _, _, rest = card.partition(f"| {' | '.join(_BEFORE_NOTES)} |\n")
-    _, _, rest = rest.partition("\n\n")  # the end of the table
+    # The end of the table.
+    _, _, rest = rest.partition("\n\n")
     notes, _, _ = f"\n\n{rest}".rpartition(f"\n\n{_AFTER_NOTES}\n")
     return notes.strip()
 

@@ -75,7 +75,8 @@ def local_copy(remote: RemoteFolder, manifest: bytes, folder: Path) -> Path:
     with machine_errors("write", folder):
         folder.parent.mkdir(parents=True, exist_ok=True)
     with _one_process(folder.with_name(f"{folder.name}.lock")):
-        if not (folder / MANIFEST).is_file():  # else another process was faster
+        if not (folder / MANIFEST).is_file():
+            # Else another process was faster.
             unfinished = folder.with_name(f"{folder.name}.part")
             write_file(unfinished / MANIFEST, manifest)
             _download(remote, unfinished)
@@ -143,21 +144,25 @@ def _fetch(remote: RemoteFolder, folder: Path, files: Sequence[ListedFile]) -> N
 def _save(remote: RemoteFolder, folder: Path, file: ListedFile) -> None:
     """Download a file unless an earlier call did, and verify it."""
     path = folder / file.name
-    if path.is_file():  # has been verified before it got this name
+    if path.is_file():
+        # Has been verified before it got this name.
         return
     beginning = path.with_name(f"{path.name}.part")
     with machine_errors("write", path):
         path.parent.mkdir(parents=True, exist_ok=True)
-    for anew in (False, True):  # a damaged file is downloaded once more
+    # A damaged file is downloaded once more.
+    for anew in (False, True):
         try:
             remote.save(file.name, beginning, max_bytes=file.max_bytes, anew=anew)
         except FileNotFoundError as error:
-            if file.name in DESCRIPTIONS:  # a published folder may lack them
+            if file.name in DESCRIPTIONS:
+                # A published folder may lack them.
                 return
             raise DatasetError(
                 f"{file.name} is missing, which manifest.json lists"
             ) from error
-        except Exception as error:  # libraries of file systems raise any of them
+        except Exception as error:
+            # Libraries of file systems raise any of them.
             raise MachineError(
                 f"the download of {remote.url} was interrupted at {file.name}:"
                 f" {type(error).__name__}: {error!s:.300}; the same call continues it"

@@ -50,7 +50,8 @@ class FileSystemFolder(RemoteFolder):
         try:
             with path.open("ab") as target:
                 self.append(name, target, max_bytes)
-        except ValueError:  # from servers that cannot begin in the middle of a file
+        except ValueError:
+            # From servers that cannot begin in the middle of a file.
             path.unlink()
             with path.open("ab") as target:
                 self.append(name, target, max_bytes)
@@ -123,7 +124,8 @@ def _read_manifest(folder: FileSystemFolder) -> bytes:
         folder.append(MANIFEST, content, MAX_DOCUMENT_BYTES)
     except FileNotFoundError:
         return b""
-    except Exception as error:  # libraries of file systems raise any of them
+    except Exception as error:
+        # Libraries of file systems raise any of them.
         text = f"{type(error).__name__}: {error!s:.300}"
         raise MachineError(f"{folder.url} cannot be read: {text}") from error
     return content.getvalue()

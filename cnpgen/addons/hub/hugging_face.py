@@ -58,7 +58,8 @@ class HubFolder(RemoteFolder):
                 force_download=anew,
                 library_name="cnpgen",
             )
-        except LocalEntryNotFoundError as error:  # is a FileNotFoundError, too
+        except LocalEntryNotFoundError as error:
+            # Is a FileNotFoundError, too.
             raise ConnectionError(f"{error}") from error
         return Path(file)
 
@@ -112,6 +113,7 @@ def _manifest(remote: HubFolder) -> Path | None:
     except (RepositoryNotFoundError, RevisionNotFoundError) as error:
         text = f"{remote.url} was not found; a private repository needs HF_TOKEN or 'hf auth login'"
         raise UsageError(text, concerns="folder") from error
-    except (OSError, ValueError) as error:  # the others of huggingface_hub
+    except (OSError, ValueError) as error:
+        # The others of huggingface_hub.
         text = f"{remote.url} cannot be read: {error!s:.300}"
         raise MachineError(text) from error

@@ -215,15 +215,15 @@ def upload_files(
             folder_path=folder,
             repo_type="dataset",
             allow_patterns=files,  # names without wildcards
-            delete_patterns=[
-                f"{part}/*" for part in (PARQUET, HDF5)
-            ],  # those that the folder does not contain
+            # Those that the folder does not contain.
+            delete_patterns=[f"{part}/*" for part in (PARQUET, HDF5)],
         )
     except (
         OSError,
         ValueError,
         RuntimeError,
-    ) as error:  # the errors of huggingface_hub are OSError or ValueError
+    ) as error:
+        # The errors of huggingface_hub are OSError or ValueError.
         hint = "'hf auth login' stores a token; the same command continues an interrupted upload"
         raise MachineError(
             f"{repository} was not uploaded: {error!s:.300}; {hint}"

@@ -49,7 +49,8 @@ def run(arguments: argparse.Namespace) -> None:
     from cnpgen.addons.hub.publish import publish_dataset
 
     folder = arguments.folder
-    own = folder.resolve()  # "." has no name
+    # "." has no name
+    own = folder.resolve()
     out = arguments.out or own.with_name(f"{own.name}-hub")
     url = publish_dataset(
         folder,

@@ -44,9 +44,8 @@ class ArmJoint:
     upper: float
     velocity: float  # limit [rad/s or m/s]
     effort: float  # limit of the torque or force [N m or N]; 0 where the URDF has none
-    missing: tuple[
-        str, ...
-    ]  # limits that the URDF does not have: "position", "velocity", "torque"
+    # Limits that the URDF does not have: "position", "velocity", "torque".
+    missing: tuple[str, ...]
     replaced: tuple[str, ...] = ()  # limits of the same names that another file states
 
 
@@ -56,22 +55,19 @@ class Arm:
 
     urdf: Path
     tip: str  # frame
-    planned: tuple[
-        ArmJoint, ...
-    ]  # joints between the root and the tip, from the root outwards
+    # Joints between the root and the tip, from the root outwards.
+    planned: tuple[ArmJoint, ...]
     locked: tuple[str, ...]  # names of all other joints that move: they stay at zero
     moved: tuple[str, ...]  # links that planned joints move
     frames: tuple[str, ...]  # names of all links and joints
     masses: Mapping[str, float]  # link -> mass [kg]; 0 where it has none
-    impossible: tuple[
-        str, ...
-    ]  # links that planned joints move with inertias that no body has
+    # Links that planned joints move with inertias that no body has.
+    impossible: tuple[str, ...]
     shaped: tuple[str, ...]  # links that have a ``<collision>`` element
     meshes: tuple[str, ...]  # mesh files that links name
     visual: tuple[str, ...]  # links that have a ``<visual>`` and no ``<collision>``
-    locked_positions: Mapping[
-        str, float
-    ]  # locked joints that do not stay at zero -> position [rad or m]
+    # Locked joints that do not stay at zero -> position [rad or m].
+    locked_positions: Mapping[str, float]
     doubts: tuple[str, ...]  # sentences about numbers that are probably wrong
     friction: tuple[JointFriction, ...]  # friction of planned joints that have any
     joint_notes: tuple[str, ...]  # about further elements of planned joints

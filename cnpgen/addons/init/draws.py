@@ -152,7 +152,8 @@ def find_boxes(pipeline: Pipeline) -> tuple[Pipeline, float]:
     robot = load_robot(pipeline.problem)
     world = World(robot)
     tips = _measure_states(world, _states(robot)[:500])[0]
-    world = World(robot)  # at the base configuration
+    # At the base configuration.
+    world = World(robot)
     centre, reach = (
         world.tip_position,
         float(np.linalg.norm(tips - robot.chain.joints[0].translation, axis=1).max()),
@@ -196,9 +197,8 @@ def _boxes(
         )
         return x, y, z
 
-    min_distance = (
-        math.floor(1e3 * distance) / 1e3 if aside < 2 else 0.0
-    )  # in the horizontal plane
+    # In the horizontal plane.
+    min_distance = math.floor(1e3 * distance) / 1e3 if aside < 2 else 0.0
     return DrawPositions(
         start=box(centre - shift), goal=box(centre + shift), min_distance=min_distance
     )
@@ -210,6 +210,7 @@ def _accepted(pipeline: Pipeline) -> float:
     prepared = PreparedPipeline(pipeline, backend=backend, cache_folder=cache_folder)
     try:
         sampling = prepared.block(0, "train", 0, stop=YIELD_ROWS).sampling
-    except RecipeError:  # too few candidates are accepted
+    except RecipeError:
+        # Too few candidates are accepted.
         return 0.0
     return sampling.accepted / sampling.tried

@@ -88,9 +88,8 @@ def run(arguments: argparse.Namespace) -> None:
         *packages_of_environment(arm.meshes, arm.urdf, arguments.packages),
     )
     with warnings.catch_warnings():
-        warnings.simplefilter(
-            "ignore", RuntimeWarning
-        )  # about the robot, which are in the notes
+        # About the robot, which are in the notes.
+        warnings.simplefilter("ignore", RuntimeWarning)
         initial = problem_of(
             arm,
             folder.name,

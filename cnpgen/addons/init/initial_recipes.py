@@ -83,9 +83,8 @@ def problem_of(
     )
     spec = replace(problem.robot, skipped_meshes=skipped_meshes)
     problem = replace(problem, robot=spec)
-    with warnings.catch_warnings(
-        record=True
-    ) as caught:  # such as those about simplified meshes
+    # Such as those about simplified meshes.
+    with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         overlaps = resolve_overlaps(problem) if arm.has_shape else None
         problem = overlaps.problem if overlaps else problem
@@ -100,9 +99,8 @@ def problem_of(
     )
     problem = replace(problem, limits=limits)
     problem = _with_jerk_limits(problem, robot, joint_limits)
-    if (
-        robot.chain.joints[-1].mass > 0
-    ):  # torques of links without masses are meaningless
+    if robot.chain.joints[-1].mass > 0:
+        # Torques of links without masses are meaningless.
         limit = JointTorque(tolerance=5e-3, budget=6e-2)
         problem = replace(
             problem,

@@ -45,7 +45,8 @@ def resolve_overlaps(problem: Problem) -> LinkOverlaps:
     problem, parts = _decompose(problem, hulls)
     problem, parts, contacts = _ignore_contacts(problem, parts)
     shape, ignored = load_robot(problem).shape, problem.robot.ignored_pairs
-    assert shape is not None  # problems of ``init`` have the geometry of the URDF
+    # Problems of ``init`` have the geometry of the URDF.
+    assert shape is not None
     contacts += _pair_notes(shape.pairs, {*map(frozenset, ignored)})
     problem = replace(
         problem, robot=replace(problem.robot, hull_gap=round(parts.fraction, 4))

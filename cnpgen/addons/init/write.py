@@ -47,7 +47,8 @@ def problem_text(initial: InitialProblem, folder: Path) -> str:
     places["robot.packages"] = tuple(
         _from(folder, each) for each in problem.robot.packages
     )
-    if arm.friction:  # stated although "ignore" is the default
+    if arm.friction:
+        # Stated although "ignore" is the default.
         places["drive.urdf_dynamics"] = problem.drive.urdf_dynamics
     if problem.robot.srdf:
         places["robot.srdf"] = _from(folder, problem.robot.srdf)

@@ -128,7 +128,8 @@ class ChunkExecutor:
         self._runtime: PlanRuntime | None = None
         self._latched: SwitchOutcome | None = SwitchOutcome.STOPPED
         self._clock = CallersClock(self._stale_after)
-        self._observed = -np.inf  # time of the last observation
+        # Time of the last observation.
+        self._observed = -np.inf
 
     @property
     def stopped(self) -> SwitchOutcome | None:
@@ -154,7 +155,8 @@ class ChunkExecutor:
                 self._robot, {"start_q": q[None], "start_dq": dq[None]}, noun="state"
             )
         resting = np.abs(dq) <= MAX_RESTING_SPEED * self._robot.velocity_limit
-        if not resting.all():  # nan does not rest
+        if not resting.all():
+            # Nan does not rest.
             joint = int(resting.argmin())
             name = self._record.joint_names[joint]
             raise UsageError(
@@ -318,7 +320,8 @@ class ChunkExecutor:
                 return
             self._latched = cause
         begin = runtime.now + STOP_DELAY_S
-        if in_background:  # a stop takes longer than a set point may
+        if in_background:
+            # A stop takes longer than a set point may.
             threading.Thread(target=runtime.stop, args=(begin,), daemon=True).start()
         else:
             runtime.stop(begin)
@@ -339,7 +342,8 @@ class ChunkExecutor:
         error = np.abs(measured[0] - runtime.state_at(time).q)
         speed = np.abs(measured[1]) / self._robot.velocity_limit
         follows = (error <= self._tracking_error) & (speed <= MAX_MEASURED_SPEED)
-        return None if follows.all() else SwitchOutcome.TRACKING  # nan does not follow
+        # Nan does not follow.
+        return None if follows.all() else SwitchOutcome.TRACKING
 
     def _refusal(
         self, outcome: SwitchOutcome, at: float, detail: str = ""

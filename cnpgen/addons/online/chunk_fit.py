@@ -142,7 +142,8 @@ def chunk_fit(length: int, rate: float) -> ChunkFit:
     samples = min(END_SAMPLES, length)
     x = np.arange(samples) * step
     ramp = _smooth_step(_greville(RATE_POINTS) / RAMP_SHARE)
-    ramp[:2] = 0.0  # r and r' at the start determine the path there
+    # r and r' at the start determine the path there
+    ramp[:2] = 0.0
     return ChunkFit(
         spec,
         length,

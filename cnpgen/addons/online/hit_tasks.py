@@ -165,7 +165,8 @@ def _check_distance(
         [[contact_distance], *(values.ravel() for values in positions.values())]
     )
     if np.abs(values).max() <= MAX_LIMIT_RATIO * completion.context.robot.reach:
-        return  # the usual case: the check takes 50 microseconds
+        # The usual case: the check takes 50 microseconds.
+        return
     lengths = {"contact_distance": np.array([[contact_distance]])}
     lengths |= {name: values.T for name, values in positions.items()}
     check_plausible(
@@ -195,8 +196,7 @@ def lanes(name: str, values: ArrayLike, widths: set[int]) -> Array:
         raise UsageError(
             f"must have shape {expected}, got {np.shape(values)}", argument=name
         )
-    if (
-        not math.isfinite(np.vdot(array, array)) and not np.isfinite(array).all()
-    ):  # vdot takes a third of the time
+    if not math.isfinite(np.vdot(array, array)) and not np.isfinite(array).all():
+        # vdot takes a third of the time
         raise UsageError(f"must be finite, got {array}", argument=name)
     return array.T

@@ -52,9 +52,8 @@ MAX_MEETING_ERROR_S = 1e-4  # of the time at which mallet and puck meet
 EXPECTED_HIT_SPEED_M_S = 1.5  # of the first iteration
 TOO_LATE = "the mallet cannot meet the puck in time"
 NO_MEETING = "no meeting time: the iteration does not converge"
-ROLLING_SHARE = (
-    1 / 3
-)  # of the tangential velocity that a homogeneous disc takes over when it rolls
+# Of the tangential velocity that a homogeneous disc takes over when it rolls.
+ROLLING_SHARE = 1 / 3
 MAX_BOUNCES = 4  # on the bands, of one prediction
 ANGLE_ITERATIONS = 8
 
@@ -295,7 +294,8 @@ def plan_moving_hits(
         active = active[tasks.alive]
         speed[active] = tasks["hit_speed"][0]
         if hits.waits and iteration == 0 and len(active):
-            continue  # the direction depends on the speed
+            # The direction depends on the speed.
+            continue
         columns = {name: tasks[name][0] for name in CONTEXT}
         plans = plan_tasks(
             planner,

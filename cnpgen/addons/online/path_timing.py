@@ -205,9 +205,8 @@ def retimed(motion: SampledMotion, law: TimeLaw) -> SampledMotion:
     times = grid(law.duration)
     u, brake, travel = shape_at(times / law.duration, law.rise, law.fall)
     sigma = law.start + law.duration * travel
-    if (
-        sigma[-1] >= motion.end_time - TIMING_ROUNDING
-    ):  # a slower end stops with the path
+    if sigma[-1] >= motion.end_time - TIMING_ROUNDING:
+        # A slower end stops with the path.
         sigma = np.minimum(sigma, np.nextafter(motion.end_time, -np.inf))
     q, dq, ddq = motion.at(sigma)
     u[-1] = brake[-1] = 0.0  # exactly at rest

@@ -31,11 +31,12 @@ from cnpgen.schema.arguments import numbers
 Array = NDArray[np.float64]
 Executable = Plans | JoinedPlans | PlannedHits
 
+# Of q [rad]; of dq and ddq as fractions of the limits.
 MAX_SWITCH_GAPS = (
     1e-6,
     1e-5,
     1e-3,
-)  # of q [rad]; of dq and ddq as fractions of the limits
+)
 MAX_END_SPEED = 1e-6  # fraction of the velocity limits: a plan ends at rest
 MAX_END_ACCELERATION = 1e-3  # fraction of the limits: larger ones are reduced to zero
 
@@ -64,7 +65,8 @@ class Admission:
         self._judge, self._checker, self._step = judge, checker, grid_step
         self._parameters = _checked_parameters(record, self._robot, parameters)
         self._judges: dict[ProblemRecord, Judge] = {}
-        self._lock = threading.Lock()  # the memory of a judge is that of one thread
+        # The memory of a judge is that of one thread.
+        self._lock = threading.Lock()
 
     def refusal_or_motion(
         self, plan: Plans | JoinedPlans, at: float

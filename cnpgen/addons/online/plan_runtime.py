@@ -121,7 +121,8 @@ class PlanRuntime:
         self._kept_stops = KeptStops(self._checker, measured=judge)
         self._keeps_stops = keep_stops
         self._requests = ReplanRequests()
-        self._stop: Stop | None = None  # until the runtime is resumed
+        # Until the runtime is resumed.
+        self._stop: Stop | None = None
         self._stops, self._closed = 0, False
 
     def __enter__(self) -> PlanRuntime:
@@ -259,7 +260,8 @@ class PlanRuntime:
         at = number("at", at)
         with self._stopping:
             with self._lock:
-                self._stops += 1  # refuses all plans of earlier requests
+                # Refuses all plans of earlier requests.
+                self._stops += 1
                 if self._stop is not None:
                     return self._stop
                 begin = max(at, self._timeline.now)

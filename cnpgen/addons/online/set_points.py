@@ -110,7 +110,8 @@ def sample_motion(
     edges, coefficients, last = [], [], np.zeros(0)
     for part, begin, end in parts_of(plan):
         if end <= begin:
-            continue  # the next part replaces it at once
+            # The next part replaces it at once.
+            continue
         times = grid(end - begin, step)
         states = part.motion.at_times(times[None])
         coefficients.append(

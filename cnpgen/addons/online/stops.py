@@ -100,7 +100,8 @@ def with_smooth_end(
     travel = shape_table()[2][:, -1]
     duration = np.repeat(SMOOTH_END_TIMES_S, len(travel))
     shape = np.tile(np.arange(len(travel), dtype=np.int64), len(SMOOTH_END_TIMES_S))
-    path = duration * travel[shape]  # of the motion that is retimed [s]
+    # Of the motion that is retimed [s].
+    path = duration * travel[shape]
     begin = motion.end_time - path
     feasible = (path < length) & limits.feasible(
         np.maximum(begin, motion.start), duration, shape

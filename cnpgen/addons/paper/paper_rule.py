@@ -124,7 +124,8 @@ def _is_clear(problem: Problem, world: PathWorld, obstacle_poses: Array) -> bool
     for index, (obstacle, solid) in enumerate(
         zip(problem.obstacle, solids_of(problem.obstacle, obstacle_poses), strict=True)
     ):
-        if not obstacle.upright:  # the paper has rules for upright boxes only
+        if not obstacle.upright:
+            # The paper has rules for upright boxes only.
             if not np.all(measured[index] > -MAX_OBJECT_DEPTH_M):
                 return False
             continue
@@ -133,9 +134,8 @@ def _is_clear(problem: Problem, world: PathWorld, obstacle_poses: Array) -> bool
             low[2] = -np.inf
         offset = center - np.clip(center, low, high)
         distance = np.sqrt(np.einsum("ik,ik->k", offset, offset))
-        corners = world.object_corners(
-            distance < reach
-        )  # at other states no corner is inside
+        # At other states no corner is inside.
+        corners = world.object_corners(distance < reach)
         depth = np.minimum(corners - low, high - corners).min(axis=1)
         if not (
             np.all(distance > size[2] / 2 - MAX_OBJECT_DEPTH_M)

@@ -76,9 +76,8 @@ class Proposals:
         random: np.random.Generator,
     ) -> Array:
         """Sample a next configuration [rad], shape (n,), from a state of shape (2 n,) towards a goal of shape (n,)."""
-        poses = obstacle_poses[
-            None, : len(self.mean) - 2 * len(state)
-        ]  # without the puck of a hit
+        # Without the puck of a hit.
+        poses = obstacle_poses[None, : len(self.mean) - 2 * len(state)]
         inputs = standardize(
             inputs_of(state[None], goal_q[None], poses), self.mean, self.scale
         )

@@ -163,7 +163,8 @@ class LinkOrientation(_LinkPoseConstraint):
         rows = list[Any]()
         for axis in self.bounded:
             sine, cosine = np.sin(self.limits[axis]), np.cos(self.limits[axis])
-            if axis == 1:  # D_02 = sin b
+            if axis == 1:
+                # D_02 = sin b
                 rows += [sine - D[0][2], sine + D[0][2]]
                 continue
             y, x = pairs[axis]

@@ -69,7 +69,8 @@ def pose_of(pose: Any, where: str) -> Pose:
     if not isinstance(pose, dict):
         raise SceneError(f"{where}: a pose must be a mapping, got {pose!r:.60}")
     position = vector(pose.get("position"), "xyz", f"{where}: position")
-    if not (np.abs(position) <= MAX_COORDINATE_M).all():  # also false for nan
+    if not (np.abs(position) <= MAX_COORDINATE_M).all():
+        # Also false for nan.
         raise SceneError(
             f"{where}: position must be finite and at most {MAX_COORDINATE_M:g}, got {position.tolist()}"
         )

@@ -139,7 +139,8 @@ def read_goal_pose(
         position=placed[0],
         rotation=placed[1],
         position_tolerance=radius
-        / np.sqrt(3),  # a cube in the region, for any orientation
+        # A cube in the region, for any orientation.
+        / np.sqrt(3),
         rotation_tolerance=tolerance,
     )
 

@@ -15,13 +15,14 @@ from cnpgen.problems.scenes.yaml_document import part, vector
 from cnpgen.robots.obstacle import Obstacle
 from cnpgen.robots.shape.hull import Array
 
+# Codes of shape_msgs/SolidPrimitive.
 PRIMITIVES = {
     "1": "box",
     "2": "sphere",
     "3": "cylinder",
     "4": "cone",
     "5": "prism",
-}  # codes of shape_msgs/SolidPrimitive
+}
 REMEDIES = {
     "cone": "give a mesh of it",
     "prism": "give a mesh of it",
@@ -96,7 +97,8 @@ def primitive_sizes(primitive: Any, where: str) -> Array:
         part(primitive, "dimensions", list, where), "", f"{where}: dimensions"
     )
     is_cylinder = primitive_kind(primitive) == "cylinder"
-    return sizes[::-1] if is_cylinder else sizes  # MoveIt: height and radius
+    # MoveIt: height and radius
+    return sizes[::-1] if is_cylinder else sizes
 
 
 def _primitive(primitive: Any, pose: Pose, where: str) -> ObjectShape:

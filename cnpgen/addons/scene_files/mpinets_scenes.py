@@ -199,9 +199,8 @@ def _names(file: Hdf5, rows: slice, count: int) -> list[str]:
 
 def _is_present(kind: str, values: Array) -> NDArray[np.bool_]:
     """Return which entries are obstacles: those without a size of zero."""
-    return np.asarray(
-        (values[:, : sum(_SHAPES[kind][1])] != 0).all(axis=1)
-    )  # nan counts as a size
+    # Nan counts as a size.
+    return np.asarray((values[:, : sum(_SHAPES[kind][1])] != 0).all(axis=1))
 
 
 def _obstacles(numbers: dict[str, Array], place: str) -> Iterator[Obstacle]:

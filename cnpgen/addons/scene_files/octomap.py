@@ -136,7 +136,8 @@ def _read_full(data: bytes, at: int, cell: Cell, cells: list[Cell]) -> int:
     mask, at = data[at + 4], at + 5
     if not np.isfinite(log_odds):
         raise ValueError("a node has a log-odds that is not finite")
-    if not mask and log_odds >= 0:  # probability of at least one half
+    if not mask and log_odds >= 0:
+        # Probability of at least one half.
         cells.append(cell)
     for child, each in enumerate(_children(cell) if mask else []):
         if mask >> child & 1:
@@ -152,7 +153,8 @@ def _boxes(
     edge = min(cell[3] for cell in cells)
     while edge * resolution > MAX_RESOLUTION_M:
         edge //= 2
-    center = 1 << DEPTH - 1  # the root is around the origin
+    # The root is around the origin.
+    center = 1 << DEPTH - 1
     corners = [
         side for x, y, z, size in cells for at in (x, y, z) for side in (at, at + size)
     ]

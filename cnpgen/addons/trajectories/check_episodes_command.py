@@ -175,7 +175,8 @@ def _calibrated(path: Path, arm: "RecordedArm") -> list[float]:
     except (ValueError, KeyError, TypeError) as error:
         text = f"{path} is not a calibration of {arm.name}: {error!r:.120}"
         raise UsageError(text, argument="calibration") from error
-    if not all(0 < factor <= math.pi / 100 for factor in factors):  # a turn for 200
+    if not all(0 < factor <= math.pi / 100 for factor in factors):
+        # A turn for 200.
         text = f"{path}: every range must be above 0 and at most a turn of {arm.name}"
         raise UsageError(text, argument="calibration")
     return factors

@@ -35,7 +35,8 @@ def explain_velocities(
     noise = 2 * errors.q / float(np.median(h)) + errors.dq
     size = _rms(mean[:, joint])
     if size <= noise:
-        return ""  # a joint at rest explains nothing
+        # A joint at rest explains nothing.
+        return ""
     if not trajectory.dq[:, joint].any():
         return f"those of {joint_names[joint]} are 0 while it moves"
     difference = _rms(mean[:, joint] - _mean_of_neighbors(trajectory.dq[:, joint]))

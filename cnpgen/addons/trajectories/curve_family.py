@@ -33,9 +33,8 @@ class CurveFamily:
     t: Array  # times of the knots [s], from 0 to the duration, shape (S + 1,)
     # Bernstein coefficients of the nominal positions [rad], shape (d + 1, S, n).
     coefficients: Array
-    bounds: tuple[
-        Array, Array, Array, Array
-    ]  # largest differences of q, dq, ddq and jerk, shape (S, n) each
+    # Largest differences of q, dq, ddq and jerk, shape (S, n) each.
+    bounds: tuple[Array, Array, Array, Array]
     # Whether the nominal jerks are those of the polynomials; otherwise they are 0.
     has_jerk: bool = True
 

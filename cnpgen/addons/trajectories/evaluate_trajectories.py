@@ -239,9 +239,10 @@ def _check_scene(index: int, trajectory: Trajectory, problem: Problem) -> None:
     """Check that a trajectory has the obstacles that samples of a problem place."""
     if trajectory.obstacle_poses is not None:
         obstacles = tuple(problem.obstacle)
+        # Checks the shape and the values.
         Scene(obstacles, np.empty((1, pose_width(obstacles)))).with_poses(
             trajectory.obstacle_poses[None]
-        )  # checks the shape and the values
+        )
     elif problem.has_sample_obstacles:
         text = f"trajectory {index} has no scene: samples of {problem.name!r} place its obstacles, which"
         raise UsageError(

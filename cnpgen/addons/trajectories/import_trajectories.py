@@ -190,7 +190,8 @@ def _boundary(
         )
         snapped.append(_snapped(snapper, (q, dq, ddq), end, given, allowed))
     (first, moved_first), (last, moved_last) = snapped
-    change = float(np.maximum(moved_first, moved_last))  # nan if one of them is
+    # Nan if one of them is.
+    change = float(np.maximum(moved_first, moved_last))
     parameters = None if trajectory.parameters is None else trajectory.parameters[None]
     start_q, start_dq, start_ddq, goal_q, goal_dq = (
         part[None] for part in (*first, *last[:2])

@@ -22,12 +22,13 @@ Array = NDArray[np.float64]
 Interpolation = Literal["hold", "linear", "cubic", "quintic"]
 
 INTERPOLATIONS = ("hold", "linear", "cubic", "quintic")
+# That the data must have.
 _DERIVATIVES = {
     "hold": 0,
     "linear": 0,
     "cubic": 1,
     "quintic": 2,
-}  # that the data must have
+}
 KERNEL_NODES = 240  # of the integral over a kernel
 KERNEL_PHASES = 9  # in a span, at which the integral is evaluated
 KERNEL_MARGIN = 1.05  # factor on the integral, for phases and nodes between
@@ -65,7 +66,8 @@ def interpolated(
     bounds = [
         np.repeat(error[:, None], trajectory.q.shape[1], axis=1) for error in errors
     ]
-    for order in range(len(data) + 1, 4):  # derivatives that jump at the knots
+    # Derivatives that jump at the knots.
+    for order in range(len(data) + 1, 4):
         bounds[order] = np.full_like(bounds[order], UNDEFINED)
     if kind == "hold":
         bounds[0] = bounds[0] + np.abs(np.diff(trajectory.q, axis=0))
@@ -200,7 +202,8 @@ def hermite_weights(m: int) -> Array:
     """Return weights from m derivatives at both ends to Bernstein coefficients on [0, 1], shape (2 m, 2 m)."""
     degree = 2 * m - 1
     weights = np.zeros((2 * m, 2 * m))
-    for k in range(m):  # the k-th coefficient from an end is a sum of its derivatives
+    # The k-th coefficient from an end is a sum of its derivatives.
+    for k in range(m):
         for order in range(k + 1):
             share = comb(k, order) * factorial(degree - order) / factorial(degree)
             weights[k, order] = share
@@ -211,9 +214,8 @@ def hermite_weights(m: int) -> Array:
 def _lagrange_weights(nodes: Array) -> Array:
     """Return weights from values at nodes, shape (S, k), to Bernstein coefficients on [0, 1], shape (S, k, k)."""
     size = nodes.shape[1]
-    powers = np.zeros(
-        (len(nodes), size, size)
-    )  # of the phase, for the polynomial that is 1 at one node
+    # Of the phase, for the polynomial that is 1 at one node.
+    powers = np.zeros((len(nodes), size, size))
     for node in range(size):
         polynomial = np.zeros((len(nodes), size))
         polynomial[:, 0] = 1.0

@@ -98,7 +98,8 @@ class FamilyJudge:
         conditions = constraint.measured(cast(World, self._moved))
         name = JointTorque.condition_name
         condition = next((each for each in conditions if each.name == name), None)
-        if condition is None:  # drives whose motors alone are limited
+        if condition is None:
+            # Drives whose motors alone are limited.
             return None
         limit, allowed = condition.upper, constraint.allowed(condition)
         return TorqueLimit(condition.name, constraint.reason, limit, allowed)
@@ -136,7 +137,8 @@ class FamilyJudge:
             return TrajectoryVerdict(
                 Decision.UNDECIDED, reason, duration=family.duration
             )
-        with np.errstate(all="ignore"):  # overflows give inf or nan, which are detected
+        # Overflows give inf or nan, which are detected.
+        with np.errstate(all="ignore"):
             s = checked_phases(family, step or self._step)
             return self._judge(family, trajectory, s, scene, smooth)
 
@@ -211,7 +213,8 @@ class FamilyJudge:
         if self._problem.scene_constraint is None:
             return []
         position, velocity, acceleration = (bound[-1] for bound in family.bounds[:3])
-        if (acceleration >= UNDEFINED).all():  # velocities jump between spans
+        if (acceleration >= UNDEFINED).all():
+            # Velocities jump between spans.
             velocity = velocity + np.abs(
                 states.dq[:, -1] - family.polynomials.dq[-1, max(len(family.t) - 3, 0)]
             )
@@ -352,9 +355,8 @@ def _measured_entries(context: EvaluationContext) -> list[ConditionDecision]:
     )
     for condition, margin in between:
         key = id(condition)
-        error = float(
-            np.max(condition.uncertainty)
-        )  # that of the margin is at most as large
+        # That of the margin is at most as large.
+        error = float(np.max(condition.uncertainty))
         worst[key] = max(worst[key], margin, key=lambda candidate: candidate.severity)
         if context.phase_of is not None or not condition.relaxation.any():
             certain[key] = max(
@@ -373,9 +375,8 @@ def _certain(context: EvaluationContext, condition: MeasuredCondition) -> Array:
     """Return the relative violations that every curve has, whatever its phases are if unknown, shape (m, K)."""
     excess: Array | float = 0.0
     if context.phase_of is None:
-        excess = (
-            condition.relaxation.max() - condition.relaxation
-        )  # bounds are widest at some phase
+        # Bounds are widest at some phase.
+        excess = condition.relaxation.max() - condition.relaxation
     certain = condition.violation - 2 * condition.uncertainty - excess
     return np.asarray(
         certain / np.maximum(condition.tolerance, ZERO_TOLERANCE)[:, None]

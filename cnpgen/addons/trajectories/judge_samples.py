@@ -247,7 +247,8 @@ def _refutation(
             None,
             detail or each.detail,
         )
-        for each in reversed(found)  # two limits of one name: the worse one stays
+        # Two limits of one name: the worse one stays.
+        for each in reversed(found)
     }
     first = conditions[found[0].margin.name]
     return TrajectoryVerdict(

@@ -67,7 +67,8 @@ class LeRobotDataset(Exporter):
                 concerns="rate",
             )
         if (path / LEROBOT_INFO).exists():
-            (path / LEROBOT_INFO).unlink()  # an incomplete dataset has none
+            # An incomplete dataset has none.
+            (path / LEROBOT_INFO).unlink()
         names = _names(exported)
         episodes, files = _write_frames(path, plans, exported, names)
         task = f"{exported.problem}: move to the goal"

@@ -18,6 +18,7 @@ Values = NDArray[Any]
 MESSAGE_TIME = "t [s]"  # of formats that define the unit
 _POINT_FIELDS = {"positions": "q", "velocities": "dq", "accelerations": "ddq"}
 _STATE_FIELDS = {"position": "q", "velocity": "dq"}  # of sensor_msgs/JointState
+# Keys of messages that hold messages: plans, action goals and responses of MoveIt.
 _NESTING = (
     "joint_trajectory",
     "trajectory",
@@ -28,7 +29,7 @@ _NESTING = (
     "goal",
     "result",
     "response",
-)  # keys of messages that hold messages: plans, action goals and responses of MoveIt
+)
 _OTHER_POINTS = "multi_dof_joint_trajectory"  # motions of a base
 _SUCCESS = 1  # moveit_msgs/MoveItErrorCodes
 

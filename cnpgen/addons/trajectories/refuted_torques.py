@@ -153,9 +153,10 @@ def _remainder(
     offsets = np.concatenate([np.zeros((1, n)), np.diag(moved), -np.diag(moved)])
     still, units = np.zeros_like(offsets), np.eye(n)
     fixed = torques(q + offsets, v + still, still)
+    # Column k of M at every row, shape (n, rows, n).
     masses = np.stack(
         [torques(q + offsets, still + v, still + unit) - fixed for unit in units]
-    )  # column k of M at every row, shape (n, rows, n)
+    )
     speeds = np.concatenate([np.diag(faster), -np.diag(faster)])
     by_speed = torques(q + 0 * speeds, v + speeds, 0 * speeds) - fixed[0]
 

@@ -103,7 +103,8 @@ def resolved_curves(
         )
         accurate = _hermite(h, [*data[:2], accelerations], noise)
         other = chord = _hermite(h, data[:2], noise)
-        if len(data) == 2 and noise.any():  # which estimated accelerations amplify
+        if len(data) == 2 and noise.any():
+            # Which estimated accelerations amplify.
             accurate, other = chord, accurate
     resolution = [
         np.abs(accurate.values(order) - other.values(order)).max(axis=0)

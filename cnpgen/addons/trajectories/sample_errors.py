@@ -83,7 +83,8 @@ def is_negligible(
     """
     if not (errors.values.any() or errors.t):
         return True
-    if not errors.source or errors.t:  # stated errors are always used
+    if not errors.source or errors.t:
+        # Stated errors are always used.
         return False
     h = float(np.median(np.diff(trajectory.t)))
     change = max(4 * errors.q / h**2, 2 * errors.dq / h, errors.ddq)
@@ -120,7 +121,8 @@ def time_rounding(t: Array) -> tuple[str, float]:
 
     Equal steps are a grid: its times are exact, however few decimals they have.
     """
-    steps = np.diff(t)[:-1]  # the last step of a motion is often shorter
+    # The last step of a motion is often shorter.
+    steps = np.diff(t)[:-1]
     spacing = _float32_spacing(t[:, None])
     if not len(steps) or np.ptp(steps) <= 2 * spacing + 1e-12:
         return "", 0.0

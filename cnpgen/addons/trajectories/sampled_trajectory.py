@@ -129,7 +129,8 @@ class Trajectory:
     def jerks(self, t: Array) -> Array:
         """Evaluate the jerks within spans [rad/s^3] at times [s] of shape (K,), shape (K, n)."""
         times = self._clipped(t)
-        if self.dq is None:  # linear spans, of which SciPy has no third derivative
+        if self.dq is None:
+            # Linear spans, of which SciPy has no third derivative.
             return np.zeros((len(times), self.q.shape[1]))
         return np.asarray(self._piecewise(times, 3))
 

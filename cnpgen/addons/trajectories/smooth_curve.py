@@ -67,7 +67,8 @@ def smooth_curve(
     )
     inner = inner if ddq is None else ddq
     ends = []
-    for sign in (1.0, -1.0):  # the end is the start of the reversed motion
+    # The end is the start of the reversed motion.
+    for sign in (1.0, -1.0):
         flip = slice(None, None, int(sign))
         reversed_t = t if sign > 0 else t[-1] - t[::-1]
         samples = [
@@ -197,9 +198,8 @@ class _EndProgram:
                 )
         known = np.eye(size)[at_samples if given else at_samples[-1:]]
         jerks = np.diff(np.eye(size), axis=0) / steps[:, None]
-        changes = np.concatenate(
-            [np.diff(jerks, axis=0), jerks[-1:]]
-        )  # and the difference from the given jerk
+        # And the difference from the given jerk.
+        changes = np.concatenate([np.diff(jerks, axis=0), jerks[-1:]])
         width = np.append((steps[1:] + steps[:-1]) / 2, steps[-1])
         weight = (MIN_SMOOTHNESS + knots[1:] / h[0]) ** 2 * np.sqrt(h[0] ** 3 / width)
         weighted = changes * weight[:, None]

@@ -52,7 +52,8 @@ def joint_columns(
         for first in (0, 1)
     ]
     complete = [found for found in numbered if all(found)]
-    if len(complete) == 2:  # such as q0 to q6 for six joints
+    if len(complete) == 2:
+        # Such as q0 to q6 for six joints.
         first, last = complete[0][0], complete[1][-1]
         raise ValueError(
             f"{len(joints) + 1} columns from {first!r} to {last!r} for {len(joints)} joints:"

@@ -68,7 +68,8 @@ def check_units(
     if ratio is not None:
         _check_ratio(readings, ratio)
         if _is(ratio, 1.0):
-            return  # the velocities show that all are in SI units
+            # The velocities show that all are in SI units.
+            return
     if readings.time is None:
         return
     step = float(np.median(np.diff(trajectory.t)))

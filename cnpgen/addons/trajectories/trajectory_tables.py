@@ -177,7 +177,8 @@ def _split(
 ) -> Iterator[TrajectoryTable]:
     """Yield the trajectories of an archive: ``plan_00000_t`` and so on, or ``t`` and ``q`` of all."""
     parts: dict[str, dict[str, Values]] = {}
-    of_plans = {} if "q" in arrays else arrays  # "ref_q" beside "q" is no plan "ref"
+    # "ref_q" beside "q" is no plan "ref"
+    of_plans = {} if "q" in arrays else arrays
     for name, values in of_plans.items():
         if match := _PART_OF_ARCHIVE.fullmatch(name):
             parts.setdefault(match[1], {})[match[2]] = values
@@ -202,7 +203,8 @@ def _read_parquet(path: Path) -> Iterator[TrajectoryTable]:
             f"{path}: its names of joints are no list of texts, or are damaged: {error}"
         ) from error
     columns = {name: _parquet_column(table, name, path) for name in table.column_names}
-    if names and PLAN_COLUMN in columns:  # a table of cnpgen
+    if names and PLAN_COLUMN in columns:
+        # A table of cnpgen.
         index = columns.pop(PLAN_COLUMN)
         columns.pop("sample_id", None)
         for plan in dict.fromkeys(index.tolist()):
@@ -235,7 +237,8 @@ def read_parquet(path: Path) -> Any:
         pyarrow.ArrowException,
         OSError,
         ValueError,
-    ) as error:  # damaged headers; texts that are not UTF-8
+    ) as error:
+        # Damaged headers; texts that are not UTF-8.
         raise UsageError(
             f"{path} is not a Parquet file, or is damaged: {error}"
         ) from error
@@ -389,7 +392,8 @@ def _read_yaml(path: Path) -> Iterator[TrajectoryTable]:
         yield table_of_states(states, str(path))
         return
     for index, document in enumerate(documents):
-        if document is not None:  # topics echoed by ROS end with an empty document
+        if document is not None:
+            # Topics echoed by ROS end with an empty document.
             yield from tables_of_document(
                 document,
                 f"{path}: document {index}" if len(documents) > 2 else str(path),

@@ -34,9 +34,8 @@ class Uncertainty:
     """Errors of conditions along a family of curves."""
 
     s: Array  # phases at which the blocks begin, shape (B,)
-    errors: dict[
-        tuple[int, str], Array | float
-    ]  # by ``_key``: in every block, shape (m, B), or one of all
+    # By ``_key``: in every block, shape (m, B), or one of all.
+    errors: dict[tuple[int, str], Array | float]
 
     def add(self, condition: MeasuredCondition, s: Array) -> MeasuredCondition:
         """Return a condition at phases s, shape (K,), with the error of its values."""
@@ -152,7 +151,8 @@ def _changes(  # noqa: PLR0917 - as of uncertainty_of
         np.maximum.reduceat(values, starts, axis=1)
         for values in family.bounds_at(s)[: len(states)]
     ]
-    start_tip = np.zeros(3)  # used by the relaxation only
+    # Used by the relaxation only.
+    start_tip = np.zeros(3)
 
     def values(
         offsets: Sequence[Array], obstacle_poses: Array = scenes[0]

@@ -22,9 +22,8 @@ Array = NDArray[np.float64]
 
 DEGREE = 5
 MIN_ERRORS = np.array([1e-9, 1e-7, 1e-5])  # of q, dq, ddq: agreement with exact samples
-EXPONENTS = np.arange(
-    6.0, -15.0, -1.0
-)  # of the weight of the jerk, with a span as unit
+# Of the weight of the jerk, with a span as unit.
+EXPONENTS = np.arange(6.0, -15.0, -1.0)
 REFINED = 0.5  # of an exponent
 MIN_WITNESS_SAMPLES = 4
 JITTER_PARTS = 9  # times within the jitter at which a curve may meet a sample

@@ -84,7 +84,8 @@ def serve(
     from http import HTTPStatus
     from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 
-    drawing = Lock()  # pages are drawn one after the other
+    # Pages are drawn one after the other.
+    drawing = Lock()
 
     class Handler(BaseHTTPRequestHandler):
         timeout = _CONNECTION_TIME_S  # of every read and write
@@ -139,7 +140,8 @@ def serve(
             """Do not log requests."""
 
     class Server(ThreadingHTTPServer):
-        daemon_threads = True  # an idle connection does not delay the end
+        # An idle connection does not delay the end.
+        daemon_threads = True
 
         def handle_error(self, request: object, client_address: object) -> None:  # noqa: ARG002
             """Report an error of one connection in one line; clients that leave are no error."""

@@ -54,7 +54,8 @@ def robot_bodies(
     except (
         RecipeError,
         ValueError,
-    ):  # a mesh is missing or unreadable; the verdict does not need it
+    ):
+        # A mesh is missing or unreadable; the verdict does not need it.
         visual = []
     if visual and sum(len(body.triangles) for body in visual) <= MAX_TRIANGLES:
         return visual, "meshes"
@@ -88,9 +89,8 @@ def planned_joints(robot: Robot) -> tuple[list[dict[str, Any]], list[float]]:
     joints = []
     for index, name in enumerate(robot.joint_names):
         placement = model.jointPlacements[index + 1]
-        twist = (
-            pin.log6(placement.actInv(data.liMi[index + 1])).vector / PROBE
-        )  # linear, then angular
+        # Linear, then angular.
+        twist = pin.log6(placement.actInv(data.liMi[index + 1])).vector / PROBE
         joints.append(
             {
                 "name": name,

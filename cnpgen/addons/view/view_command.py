@@ -90,7 +90,8 @@ def _serve(arguments: argparse.Namespace) -> None:
         )
         return page_of(_scene(chosen), stamp=stamp)
 
-    _scene(arguments)  # report errors before serving
+    # Report errors before serving.
+    _scene(arguments)
     files = [
         Path(file)
         for file in (arguments.what, arguments.problem)
@@ -154,7 +155,8 @@ def _scene(arguments: argparse.Namespace) -> "ViewScene":
     noun = "row" if what.is_dir() else "plan"
     titles = [f"{problem.name}: {what.name}, {noun} {row}" for row in rows]
     verdicts: list[Verdict | None] = list(evaluate_plans(plans, workers=1).verdicts)
-    if what.is_dir():  # samples without a plan have a duration of nan and no verdict
+    if what.is_dir():
+        # Samples without a plan have a duration of nan and no verdict.
         pairs = zip(plans.duration.tolist(), verdicts, strict=True)
         verdicts = [
             None if math.isnan(duration) else verdict for duration, verdict in pairs

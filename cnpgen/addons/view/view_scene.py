@@ -70,12 +70,10 @@ class View:
     poses: Array
     world: Sequence[Body]  # obstacles, the table and the puck
     path: Sequence[Body] = ()  # path of the tip, of a motion
-    curves: Sequence[
-        dict[str, Any]
-    ] = ()  # quantities with their shares of the limits; empty without a motion
-    conditions: Sequence[
-        dict[str, Any]
-    ] = ()  # curves of the other conditions; empty without a motion
+    # Quantities with their shares of the limits; empty without a motion.
+    curves: Sequence[dict[str, Any]] = ()
+    # Curves of the other conditions; empty without a motion.
+    conditions: Sequence[dict[str, Any]] = ()
     verdict: dict[str, Any] | None = None  # None without a motion
 
 
@@ -84,9 +82,8 @@ class ViewScene:
     """The content of a page, with the names that its script has."""
 
     note: str  # remark about the bodies of the robot
-    joints: Sequence[
-        dict[str, Any]
-    ]  # placements, axes and limits of the planned joints
+    # Placements, axes and limits of the planned joints.
+    joints: Sequence[dict[str, Any]]
     tip: Sequence[float]  # pose of the tip in the frame of the last joint, by columns
     joints_and_tip: int  # number of poses of a frame
     robot: Sequence[Body]
@@ -371,9 +368,8 @@ def _poses(robot: Robot, q: Array) -> Array:
 def _world(problem: Problem, scene: Scene) -> Iterator[Body]:
     """Draw obstacles, a table and a puck."""
     for obstacle, solid in zip(scene.obstacles, scene.bodies(), strict=True):
-        if (
-            solid.position[2] <= PARKED_POSITION_M[2]
-        ):  # the plan has fewer obstacles than the problem
+        if solid.position[2] <= PARKED_POSITION_M[2]:
+            # The plan has fewer obstacles than the problem.
             continue
         if obstacle.upright and obstacle.height is None:
             bottom = min(0.0, solid.high[2] - MIN_DRAWN_HEIGHT_M)

@@ -403,7 +403,8 @@ def _draw_views(
             ylabel=f"{'xyz'[up]} [m]",
             title=f"{title} view",
         )
-        if up == 2:  # the part of the base below the floor is cut off
+        if up == 2:
+            # The part of the base below the floor is cut off.
             axis.set_ylim(bottom=max(axis.get_ylim()[0], -0.25))
 
 

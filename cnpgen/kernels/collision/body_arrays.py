@@ -67,7 +67,8 @@ def hull_vertices(corners: Array) -> HullVertices:
     radii = radii * (1 + 1e-12) + 1e-13  # above rounding errors
     spheres = np.column_stack([centers, radii])
     spheres = np.pad(spheres, [(0, -len(spheres) % LANES), (0, 0)])
-    spheres[len(radii) :, 3] = -np.inf  # no block: never searched
+    # No block: never searched.
+    spheres[len(radii) :, 3] = -np.inf
     values = np.concatenate([blocks.reshape(-1, 3).T.ravel(), spheres.T.ravel()])
     return HullVertices(values, len(padded), len(spheres))
 

@@ -153,5 +153,6 @@ class _RowKernel(Kernel):
             for arrays in (arguments, results)
         ]
         self._function(c_long(n), pointers[0], strides, pointers[1])
-        self._kernels.activate()  # raises an error if memory was lacking
+        # Raises an error if memory was lacking.
+        self._kernels.activate()
         return results

@@ -159,7 +159,8 @@ def moved_obstacle(obstacle: Obstacle, pose: Pose) -> Obstacle:
     """Return an obstacle after the motion of its frame by a pose."""
     position, rotation = pose
     if not position.any() and np.array_equal(rotation, np.eye(3)):
-        return obstacle  # its numbers stay exact
+        # Its numbers stay exact.
+        return obstacle
     x, y, z = (position + rotation @ np.array(obstacle.position)).tolist()
     if obstacle.kind == "sphere":
         return replace(obstacle, position=(x, y, z))

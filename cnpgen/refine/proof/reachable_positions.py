@@ -17,9 +17,8 @@ from cnpgen.trajectory.boundary import Boundary
 Array = NDArray[np.float64]
 NO_LIMIT = 1e6  # replaces a limit that the problem does not set
 DURATION_STEP_S = 1e-3  # of the search for the minimum duration
-SAMPLED_STEPS = np.arange(
-    10, 151, 10
-)  # from an end; later, intervals are too wide to prove anything
+# From an end; later, intervals are too wide to prove anything.
+SAMPLED_STEPS = np.arange(10, 151, 10)
 
 
 @dataclass(frozen=True)

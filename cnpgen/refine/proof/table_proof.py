@@ -102,9 +102,8 @@ class TableViolation:
     time: float  # time from the end [s]
     value: float  # see ``TableBounds.violation``
     multipliers: Array  # multipliers of the table's bounds, shape (m,)
-    box: tuple[
-        Array, Array
-    ]  # reachable joint positions: (lower, upper), shape (n,) each
+    # Reachable joint positions: (lower, upper), shape (n,) each.
+    box: tuple[Array, Array]
 
     def weight(self, bounds: TableBounds) -> float:
         """Return the weight of one metre off the table: 1, or ``HEIGHT_WEIGHT`` if only the height is violated."""

@@ -45,9 +45,8 @@ NEAR_FRACTION = 0.97
 INTERVAL_FRACTION = 0.9
 
 
-_ORDERS: dict[
-    str, list[int]
-] = {}  # structure of a problem -> result of ``condition_orders``
+# Structure of a problem -> result of ``condition_orders``.
+_ORDERS: dict[str, list[int]] = {}
 _TEMPLATES: dict[tuple[str, bytes, "Tightening"], "BoundsTemplate"] = {}
 MAX_TEMPLATES = 64
 
@@ -332,10 +331,11 @@ class BoundsTemplate:
         ):
             return bounds
         fades = near_ends(self._s)
+        # Most of the last row is unbounded.
         for g, row, fade in (
             (ends[0], 0, fades[0]),
             (ends[1], -2, fades[1]),
-        ):  # most of the last row is unbounded
+        ):
             above, below = np.fmax(g - upper[row], 0.0), np.fmax(lower[row] - g, 0.0)
             if np.any(above > 0):
                 upper = np.asfortranarray(
@@ -406,7 +406,8 @@ def _bounds(
     elif not constraint.has_solver_margin:
         inside = _added_clearance(s, tightening)[:, None] / scale
         lower, upper = lower + inside, upper - inside
-    if order < 2:  # fixed by the boundary conditions
+    if order < 2:
+        # Fixed by the boundary conditions.
         lower[s == 1], upper[s == 1] = -np.inf, np.inf
     return np.stack([lower, upper])
 

@@ -167,7 +167,8 @@ class CompiledBackend:
             library.build_subproblem,
             library.solve_subproblem,
         )
-        self._arrays: list[Any] = []  # keeps the memory of step.c alive
+        # Keeps the memory of step.c alive.
+        self._arrays: list[Any] = []
         self._points, self._m, self._nx = (
             len(motion.grid.s),
             motion.kernels.values.tape.outputs[0],
@@ -369,7 +370,8 @@ class CompiledBackend:
         dim = self._nx + 1
         rows = dim + self._m * self._points + ROWS_PER_BLOCK
         scratch = (2 * dim + ROWS_PER_BLOCK) * stride + 8 * (stride + ROWS_PER_BLOCK)
-        blocks = rows  # an upper bound: blocks have 8 rows or more
+        # An upper bound: blocks have 8 rows or more.
+        blocks = rows
         # In the order of _Polyhedron.
         sizes = rows * dim, rows, rows, rows, scratch, dim, blocks
         return _Polyhedron(dim, stride, 0, *self._allocate(sizes))

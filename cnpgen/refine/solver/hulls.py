@@ -262,9 +262,8 @@ class Hulls:
     def gradients(self, q: Array, distances: Array, groups: list[Contacts]) -> Array:
         """Differentiate the result of ``measure`` in q: shape (n, m, K), 0 for parts out of range."""
         gradients = np.zeros((q.shape[1], len(self.min_distances), self._n))
-        rotations, positions = self._kinematics.poses(
-            q
-        )  # of the joints in the world frame
+        # Of the joints in the world frame.
+        rotations, positions = self._kinematics.poses(q)
         axes, origins = (
             np.einsum("jxyk,jy->kjx", rotations[1:], self._axes),
             positions[1:].transpose(2, 0, 1),

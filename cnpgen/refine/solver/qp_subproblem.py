@@ -59,9 +59,9 @@ class ResidualSelection:
     # are selected.
     max_log_rate_change: float
     missed: Mask  # residuals that are selected in any case, shape (K, m)
-    multipliers: (
-        Array | None
-    )  # multipliers of the last step, shape (K, m), or None; residuals with one are selected
+    # multipliers of the last step, shape (K, m), or None; residuals with one are
+    # selected
+    multipliers: Array | None
 
 
 class NumpyBackend:
@@ -69,9 +69,8 @@ class NumpyBackend:
 
     def __init__(self, motion: Transcription, bounds: Bounds) -> None:
         self._motion, self._bounds = motion, bounds
-        self._evaluate = cache_last(
-            motion.evaluate
-        )  # after a rejected step the iterate is the same
+        # After a rejected step the iterate is the same.
+        self._evaluate = cache_last(motion.evaluate)
 
     def value(self, x: Array) -> tuple[float, Array, float]:
         """Evaluate the regularized objective, residuals (K, m) and their largest violation."""

@@ -166,9 +166,8 @@ def minimize(
         if deadline is None:
             continue
         deadline.note(begun)
-        feasible = (
-            None if iterate.tightened else feasible
-        )  # earlier iterates met the wider bounds only
+        # Earlier iterates met the wider bounds only.
+        feasible = None if iterate.tightened else feasible
         if iterate.violation < settings.violation_tolerance:
             found = iterate.result(iteration)
             feasible = (
@@ -222,9 +221,8 @@ class _Iterate:
         self._step_length = MAX_RADIUS
         self._multipliers: Array | None = None
         self._cost_converged = self._stalled = False
-        self._missed = np.zeros(
-            self._g.shape, bool
-        )  # residuals that a rejected step violated without their selection
+        # Residuals that a rejected step violated without their selection.
+        self._missed = np.zeros(self._g.shape, bool)
 
     def result(self, iterations: int) -> Result:
         """Return the current iterate as a result."""
@@ -258,7 +256,8 @@ class _Iterate:
             self.x, self._g, selection, proximal=proximal, penalty=self._penalty
         )
         step = self._propose(subproblem)
-        if step is None:  # no feasible point in the box, or a failure of the program
+        if step is None:
+            # No feasible point in the box, or a failure of the program.
             self._radius *= 0.25
         else:
             self._try(step, subproblem.selected)

@@ -63,9 +63,8 @@ class ResidualKernels:
     cost_term: CostTerm | None = None  # cost term in addition to the duration, or None
     # Kernel of ``cnpgen.refine.solver.residuals.cost_term_residuals``, or None.
     cost_residuals: Kernel | None = None
-    cost_counts: tuple[
-        int, ...
-    ] = ()  # number of residuals of every term of the cost term
+    # Number of residuals of every term of the cost term.
+    cost_counts: tuple[int, ...] = ()
     # Library of ``cnpgen.refine.solver.compiled_backend``, or None for the NumPy
     # backend.
     step_library: CDLL | None = None
@@ -90,18 +89,16 @@ class Transcription:
             boundary,
         )
         self.n = boundary.start_q.shape[1]
-        self._goal_points = (
-            spec.path_control_points - boundary.fixed_at_goal
-        )  # index of the goal's control points
+        # Index of the goal's control points.
+        self._goal_points = spec.path_control_points - boundary.fixed_at_goal
         self.interior = self._goal_points - 3
         self.split = self.interior * self.n
         self.nx = self.split + spec.rate_control_points
         self.obstacle_poses = obstacle_poses
         self.poses_along = np.repeat(obstacle_poses[:, None], len(grid.s), axis=1)
         self.smoothing = _smoothing(spec.rate_control_points)
-        self._at = cache_last(
-            self._states
-        )  # an accepted step is evaluated again, with derivatives
+        # An accepted step is evaluated again, with derivatives.
+        self._at = cache_last(self._states)
         self._cost_residuals = cache_last(self._evaluate_cost_residuals)
         self._boundary_derivatives = cache_last(
             lambda rate: boundary_derivatives(boundary, rate[None], spec)
@@ -262,7 +259,8 @@ class Transcription:
         gradient[self.split :] -= (
             (weights * rho / (bases.rate[0] @ rate)) @ bases.rate[0] * rate
         )
-        curvature += half.T @ half  # a product of one matrix takes half the time
+        # A product of one matrix takes half the time.
+        curvature += half.T @ half
         return float(weights @ rho)
 
     def _chain(

@@ -92,7 +92,8 @@ class Account:
                 else:
                     names = known | self.known.known()
                     key = _plain(path).rpartition(".")[2]
-                    is_entry = path.endswith("]")  # of a list, which has no name
+                    # Of a list, which has no name.
+                    is_entry = path.endswith("]")
                     hint = "" if is_entry else nearest(key, sorted(names))
                     unknown.append((key, f"{path}{hint}"))
         if unknown:
@@ -113,8 +114,10 @@ class AccountedMapping(dict[str, Any]):
             for key, value in values.items()
         )
         self.path, self.account = path, account
-        self._read: set[str] = set()  # also keys that the mapping lacks
-        self._known: set[str] = set()  # keys whose presence was checked
+        # Also keys that the mapping lacks.
+        self._read: set[str] = set()
+        # Keys whose presence was checked.
+        self._known: set[str] = set()
 
     def __contains__(self, key: object) -> bool:
         self._known.add(str(key))

@@ -51,14 +51,14 @@ def check_readable(path: Path) -> None:
     try:
         mode = path.stat().st_mode
         if stat.S_ISDIR(mode):
-            os.scandir(
-                f"{path}/."
-            ).close()  # needs the permissions to list and to enter
+            # Needs the permissions to list and to enter.
+            os.scandir(f"{path}/.").close()
         elif stat.S_ISREG(mode):
             path.open("rb").close()
     except PermissionError as error:
         raise machine_error("read", path, error) from error
-    except (OSError, ValueError):  # there is no such path
+    except (OSError, ValueError):
+        # There is no such path.
         return
 
 
@@ -110,7 +110,8 @@ def _synchronize(path: Path) -> None:
     try:
         os.fsync(descriptor)
     except OSError as error:
-        if error.errno != errno.EINVAL:  # from file systems that cannot flush a folder
+        if error.errno != errno.EINVAL:
+            # From file systems that cannot flush a folder.
             raise
     finally:
         os.close(descriptor)

@@ -84,9 +84,8 @@ def make_private_folder(folder: Path) -> None:
         if not path.is_dir():
             try:
                 path.mkdir()
-            except (
-                FileExistsError
-            ) as error:  # created by another process meanwhile, or a file
+            except FileExistsError as error:
+                # Created by another process meanwhile, or a file.
                 if path.is_dir():
                     continue
                 raise NotADirectoryError(
@@ -112,8 +111,10 @@ def exclusive_lock(lock: Path) -> Iterator[None]:
     with os.fdopen(
         os.open(lock, os.O_CREAT | os.O_RDWR, stat.S_IRUSR | stat.S_IWUSR), "r+b"
     ) as file:
-        with suppress(FileNotFoundError):  # another process has finished and removed it
-            lock.chmod(stat.S_IRUSR | stat.S_IWUSR)  # independent of the umask
+        # Another process has finished and removed it.
+        with suppress(FileNotFoundError):
+            # Independent of the umask.
+            lock.chmod(stat.S_IRUSR | stat.S_IWUSR)
         end = time.monotonic() + MAX_LOCK_WAIT_S
         while not try_lock(file) and time.monotonic() < end:
             time.sleep(0.02)
@@ -155,9 +156,8 @@ def trust_problem(folder: Path) -> str:
     are checked.
     """
     for path in filter(os.path.lexists, _path_components(folder.absolute())):
-        sticky = path != folder.absolute() and bool(
-            path.stat().st_mode & stat.S_ISVTX
-        )  # protects entries of others
+        # Protects entries of others.
+        sticky = path != folder.absolute() and bool(path.stat().st_mode & stat.S_ISVTX)
         if problem := _permission_problem(path, writable=sticky or path.is_symlink()):
             return problem
     subfolders = (folder / name for name in (LIBRARIES, TAPES))
@@ -203,7 +203,8 @@ def _permission_problem(path: Path, *, writable: bool = False) -> str:
         return ""
     try:
         status = path.lstat()
-    except FileNotFoundError:  # moved since it was listed
+    except FileNotFoundError:
+        # Moved since it was listed.
         return ""
     if status.st_uid not in {0, os.geteuid()}:
         return f"as {path} belongs to another user (uid {status.st_uid})"
@@ -233,5 +234,6 @@ def temporary_folder() -> Path:
 
 
 def _remove(folder: Path, owner: int) -> None:
-    if os.getpid() == owner:  # a forked worker inherits the exit handler
+    if os.getpid() == owner:
+        # A forked worker inherits the exit handler.
         shutil.rmtree(folder, ignore_errors=True)

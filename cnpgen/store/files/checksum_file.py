@@ -23,9 +23,8 @@ from cnpgen.store.files.kind import HDF5, apparent_kind, kind_name, own_kind
 from cnpgen.store.files.size_limits import MAX_CHECKSUM_FILE_BYTES
 
 HEADER_BYTES = 512
-_HEADER_PART = re.compile(
-    rb"cnpgen-[a-z]+ [0-9]|sha256 [0-9a-f]{64}"
-)  # at least one remains of a damaged header
+# At least one remains of a damaged header.
+_HEADER_PART = re.compile(rb"cnpgen-[a-z]+ [0-9]|sha256 [0-9a-f]{64}")
 _CHECKSUM = re.compile(rb"(cnpgen-[a-z]+) ([0-9]{1,6})\nsha256 ([0-9a-f]{64})\n")
 _CHANGED = f"{{}} is damaged: its first {HEADER_BYTES} bytes were changed"
 

@@ -22,9 +22,8 @@ from cnpgen.store.files.size_limits import MAX_DOCUMENT_BYTES, MAX_DOCUMENT_DEPT
 
 MAX_SHOWN_CHARACTERS = 80  # longer pairs of values are left out of messages
 _BLANK = "0" * 64
-_SCALARS = frozenset(
-    {int, bool, str, type(None)}
-)  # types that JSON has for every value
+# Types that JSON has for every value.
+_SCALARS = frozenset({int, bool, str, type(None)})
 _NESTED = frozenset({dict, list})
 _SURROGATE = re.compile(r"\\u[dD][89a-fA-F]")  # half of a UTF-16 surrogate pair
 _CHECKSUM = re.compile(r'"self_sha256": "([0-9a-f]{64})"\n}\n\Z')
@@ -37,7 +36,8 @@ def plain(value: Any) -> Any:
     if isinstance(value, np.ndarray | np.generic):
         return plain(value.tolist())
     if isinstance(value, list | tuple):
-        kinds = set(map(type, value))  # fast paths for long lists of numbers
+        # Fast paths for long lists of numbers.
+        kinds = set(map(type, value))
         is_plain = kinds <= _SCALARS or (
             kinds == {float} and all(map(math.isfinite, value))
         )
@@ -172,9 +172,8 @@ def parse_json(text: str) -> Any:
         raise _too_deep() from error
     _check_depth(value)
     if _SURROGATE.search(text):
-        json.dumps(
-            value, ensure_ascii=False
-        ).encode()  # raises a ValueError for a single surrogate
+        # Raises a ValueError for a single surrogate.
+        json.dumps(value, ensure_ascii=False).encode()
     return value
 
 

@@ -18,7 +18,8 @@ def try_lock(file: IO[bytes]) -> bool:
         fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except BlockingIOError:
         return False
-    except (ImportError, OSError):  # Windows, and file systems without locks
+    except (ImportError, OSError):
+        # Windows, and file systems without locks
         return True
     return True
 

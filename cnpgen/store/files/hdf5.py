@@ -42,12 +42,13 @@ _SYSTEM_ERRORS = {
     errno.ENOMEM,
     errno.ESTALE,
 }
+# Filters that are built into every h5py.
 _FILTERS = {
     1: "gzip",
     2: "shuffle",
     3: "fletcher32",
     32000: "lzf",
-}  # filters that are built into every h5py
+}
 
 
 def create_hdf5(buffer: io.BytesIO, *, userblock: int = 0, alignment: int = 64) -> Any:
@@ -386,7 +387,8 @@ def _checked_file(path: Path, content: bytes | None) -> Iterator[tuple[Any, int]
         if content is None:
             require_possible_size(path)
         with path.open("rb") if content is None else io.BytesIO(content) as stream:
-            size = check_heaps(path, stream)  # before HDF5 reads the file
+            # Before HDF5 reads the file.
+            size = check_heaps(path, stream)
         source: Any = path if content is None else io.BytesIO(content)
         with h5py.File(
             source, "r", locking="best-effort" if content is None else None

@@ -9,9 +9,8 @@ import numpy as np
 
 from cnpgen.errors import DatasetError
 
-_BEGIN = np.frombuffer(b"GCOL\x01\0\0\0", "<u8")[
-    0
-]  # signature and version of a collection; 7e-315 as a float64
+# Signature and version of a collection; 7e-315 as a float64.
+_BEGIN = np.frombuffer(b"GCOL\x01\0\0\0", "<u8")[0]
 _HEADER = 16  # bytes, of a collection and of each of its objects
 _CHUNK_BYTES = 1 << 23  # compared at once, which limits the memory of the comparison
 
@@ -39,9 +38,8 @@ def _collections(file: BinaryIO) -> tuple[list[int], int]:
     buffer = bytearray(min(_CHUNK_BYTES, 8 * (file.seek(0, os.SEEK_END) // 8 + 1)))
     file.seek(0)
     while count := file.readinto(buffer):  # type: ignore[attr-defined]
-        words = np.frombuffer(
-            buffer, "<u8", count // 8
-        )  # collections begin at multiples of 8 bytes
+        # Collections begin at multiples of 8 bytes.
+        words = np.frombuffer(buffer, "<u8", count // 8)
         begins += (size + 8 * np.flatnonzero(words == _BEGIN)).tolist()
         size += count
     return begins, size

@@ -20,9 +20,8 @@ from cnpgen.store.files.file_lock import try_lock
 MAX_RECORD_BYTES = 1 << 30
 _LENGTH_BYTES = 8
 _DIGEST_BYTES = hashlib.sha256().digest_size
-_MODE = (
-    os.O_RDWR | os.O_CREAT | getattr(os, "O_BINARY", 0)
-)  # the file is not truncated before it is locked
+# The file is not truncated before it is locked.
+_MODE = os.O_RDWR | os.O_CREAT | getattr(os, "O_BINARY", 0)
 
 
 def append_line(path: Path, line: str) -> None:
@@ -62,7 +61,8 @@ class JournalFile:
 
     def close(self) -> None:
         """Close and unlock the file."""
-        with suppress(OSError):  # of an incomplete record after a failed append
+        # Of an incomplete record after a failed append.
+        with suppress(OSError):
             self._file.close()
 
 
@@ -96,7 +96,8 @@ def _recover(path: Path, file: IO[bytes], magic: bytes) -> JournalFile:
     if head == magic:
         journal.records = _read_records(file)
         file.truncate()
-    else:  # a new file, or one that ended within its first line
+    else:
+        # A new file, or one that ended within its first line.
         journal.clear()
     return journal
 

@@ -9,9 +9,8 @@ MAX_HDF5_BYTES = 1 << 36  # of a file
 MAX_CHECKSUM_FILE_BYTES = 1 << 30  # of a model or a checkpoint, which are read at once
 # Maximum ratio of the unpacked numbers to the size of the file, ...
 MAX_EXPANSION = 100
-MIN_EXPANSION_LIMIT_BYTES = (
-    1 << 24
-)  # ... unless the unpacked numbers are smaller than this
+# ... unless the unpacked numbers are smaller than this
+MIN_EXPANSION_LIMIT_BYTES = 1 << 24
 MAX_DIMENSIONS = 4  # of a dataset
 MAX_NAMES = 10_000  # of datasets in a file, or of attributes
 MAX_ATTRIBUTE_BYTES = 1 << 24  # of an attribute; the largest ones are URDFs

@@ -41,7 +41,8 @@ def claim_files(
         folder.mkdir(parents=True, exist_ok=True)
         for name in own - planned:
             (folder / name).unlink(missing_ok=True)
-            with suppress(OSError):  # other files are in it
+            # Other files are in it.
+            with suppress(OSError):
                 (folder / name).parent.rmdir()
     # Before the first file is written: an interrupted call can be continued.
     _write_list(folder, dict.fromkeys(sorted(planned), ""))

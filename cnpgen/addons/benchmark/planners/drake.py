@@ -162,9 +162,8 @@ def add_boundary_conditions(program: Any, boundary: Boundary) -> None:
         program.AddPathAccelerationConstraint(np.zeros(n), np.zeros(n), 1.0)
     points, duration = program.control_points(), program.duration()
     units = [np.eye(points.shape[1])[:, [index]] for index in range(points.shape[1])]
-    second = BsplineTrajectory(program.basis(), units).EvalDerivative(0.0, 2)[
-        :, 0
-    ]  # weights of the control points
+    # Weights of the control points.
+    second = BsplineTrajectory(program.basis(), units).EvalDerivative(0.0, 2)[:, 0]
     for row, acceleration in zip(points, boundary.start_ddq[0].tolist(), strict=True):
         curvature = sum(
             weight * point

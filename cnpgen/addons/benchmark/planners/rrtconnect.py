@@ -169,7 +169,8 @@ def timed_by_toppra(
     kept[-1] = True
     points = path[kept]
     length = np.append(0.0, np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1)))
-    if not np.all(np.diff(length, prepend=-1.0) > 0):  # start and goal coincide
+    if not np.all(np.diff(length, prepend=-1.0) > 0):
+        # Start and goal coincide.
         return None
     spline = toppra.SplineInterpolator(length / length[-1], points)
     limits = [

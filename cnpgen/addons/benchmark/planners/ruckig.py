@@ -62,7 +62,8 @@ def time_optimal_motion(
     motion = ruckig.Trajectory(robot.n)
     try:
         result = ruckig.Ruckig(robot.n).calculate(state, motion)
-    except ruckig.RuckigError:  # the input is outside the limits
+    except ruckig.RuckigError:
+        # The input is outside the limits.
         return None
     if result != ruckig.Result.Working or not motion.duration > 0:
         return None

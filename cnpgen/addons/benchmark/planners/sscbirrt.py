@@ -78,7 +78,8 @@ class SSCBiRRT(BenchmarkPlanner):
         seed = int(setting.random(task).integers(SEEDS))
         try:
             result = planner.solve(question, seed=seed, trajectory=limits)
-        except package.PlanningError:  # an end is invalid
+        except package.PlanningError:
+            # An end is invalid.
             return None
         return sampled(result.trajectory) if result.success else None
 

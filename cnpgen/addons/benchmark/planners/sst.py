@@ -260,9 +260,8 @@ class SST(BenchmarkPlanner):
         parent = tree.select(position)
         q, dq = np.split(tree.state(parent), 2)
         limit = check.robot.acceleration_limit
-        ddq = (
-            random.uniform(-limit, limit) * random.random()
-        )  # often small: 12 kg need much torque
+        # Often small: 12 kg need much torque.
+        ddq = random.uniform(-limit, limit) * random.random()
         t = (
             CONTROL_STEP_S
             * np.arange(1.0, random.integers(1, self.max_steps + 1) + 1)[:, None]

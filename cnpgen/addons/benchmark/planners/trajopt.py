@@ -196,9 +196,8 @@ class TrajOptTranscription:
         n, inner = self._robot.n, KNOTS - 2
         _, dq, ddq, duration = self.unpack(x)
         step, rows = duration / KNOTS, (KNOTS - 1) * n
-        differences = (
-            np.eye(KNOTS)[1:, 1:-1] - np.eye(KNOTS)[:-1, 1:-1]
-        )  # of consecutive knots, in the inner ones
+        # Of consecutive knots, in the inner ones.
+        differences = np.eye(KNOTS)[1:, 1:-1] - np.eye(KNOTS)[:-1, 1:-1]
         selection = np.eye(KNOTS)[:-1]
         unit = np.eye(n)
         J = np.zeros((2 * rows, self._size))

@@ -122,9 +122,8 @@ def execute_in_challenge(
                 done or puck_is_done(reference, tick, *environment.puck_state())
             )
         environment.record(np.zeros(len(JOINTS)))
-    except (
-        RuntimeError
-    ) as error:  # the environment turns warnings of MuJoCo into errors
+    except RuntimeError as error:
+        # The environment turns warnings of MuJoCo into errors.
         raise UsageError(
             f"the Air Hockey Challenge's environment aborted: {error}"
         ) from error
@@ -317,9 +316,8 @@ class _Recorder:
                 for name in JOINTS
             ]
         )
-        touched = np.array(
-            self._check_collision("puck", "robot_1/ee")
-        )  # in the last step of MuJoCo
+        # In the last step of MuJoCo.
+        touched = np.array(self._check_collision("puck", "robot_1/ee"))
         self.recorded.append((q, torque, *self._puck_in_robot_frame(), touched))
 
     def _puck_in_robot_frame(self: Any) -> tuple[Array, Array]:

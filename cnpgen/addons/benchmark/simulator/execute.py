@@ -82,9 +82,8 @@ class Controller:
                 / np.abs(acceleration_torque)
             )
         torque = holding_torque + min(scale, 1.0) * acceleration_torque
-        self._delayed.extend(
-            [torque] * (self._delay + 1 - len(self._delayed))
-        )  # the first tick already holds the arm
+        # The first tick already holds the arm.
+        self._delayed.extend([torque] * (self._delay + 1 - len(self._delayed)))
         return self._delayed.popleft()
 
 
@@ -108,9 +107,8 @@ class Execution:
 def load_mujoco() -> Any:
     """Import MuJoCo; raise MissingExtraError if it is not installed or broken."""
     if sys.platform == "linux" and not os.environ.get("DISPLAY"):
-        os.environ.setdefault(
-            "MUJOCO_GL", "egl"
-        )  # renders without a screen; read when MuJoCo is imported
+        # Renders without a screen; read when MuJoCo is imported.
+        os.environ.setdefault("MUJOCO_GL", "egl")
     with requires_extra("benchmark", "MuJoCo"):
         import mujoco
     return mujoco

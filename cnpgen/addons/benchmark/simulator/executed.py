@@ -20,9 +20,8 @@ Array = NDArray[np.float64]
 
 PLANE_TOLERANCE_M = 0.02
 MAX_GOAL_DISTANCE_M = 0.01  # of a finished motion, as in the paper
-EARLY_CONTACT_M = (
-    hockey.PATH_LEFT_AT_CONTACT_M + 0.01
-)  # a contact with more of the planned path left is early
+# A contact with more of the planned path left is early.
+EARLY_CONTACT_M = hockey.PATH_LEFT_AT_CONTACT_M + 0.01
 MIN_PUCK_SPEED_M_S = 0.02  # a slower puck counts as stopped
 MAX_LEGAL_PENETRATION_M = 1e-3
 MAX_PUCK_TIME_S = 4.0  # until the puck arrives

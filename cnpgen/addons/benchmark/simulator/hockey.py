@@ -21,9 +21,8 @@ PUCK_RADIUS_M, PUCK_MASS_KG, PUCK_DRAG_N_S_M = 0.03165, 0.01, 0.005
 MALLET_RADIUS_M, MALLET_HEIGHT_M = 0.04815, 0.0645
 PUCK_HEIGHT_M = 0.006
 PUCK_OFFSET_M = 0.07  # distance of the tip from the puck's centre at the end of a hit
-PATH_LEFT_AT_CONTACT_M = (
-    MALLET_RADIUS_M + PUCK_RADIUS_M - PUCK_OFFSET_M
-)  # of the path left when both discs meet
+# Of the path left when both discs meet.
+PATH_LEFT_AT_CONTACT_M = MALLET_RADIUS_M + PUCK_RADIUS_M - PUCK_OFFSET_M
 RESTITUTION = 0.75  # of mallet and puck, and of puck and bands
 CONTACT_TIME_S = 2.5e-3  # of a bounce; ten steps of the simulation
 

@@ -73,7 +73,8 @@ def make_reference(
         raise UsageError(
             f"a plan after which the arm needs {stop:g} s to stop cannot be executed"
         )
-    first = len(during[0]) * TICK_S - duration  # the first tick after the end
+    # The first tick after the end.
+    first = len(during[0]) * TICK_S - duration
     after = np.minimum(np.append(np.arange(first, stop, TICK_S), stop), stop)[:, None]
     left = 1 - after / stop
     parts = (

@@ -72,7 +72,8 @@ def save_film(
         ImportError,
         RuntimeError,
         ValueError,
-    ) as error:  # raised by imageio without ffmpeg
+    ) as error:
+        # Raised by imageio without ffmpeg.
         text = " ".join(str(error).split())
         raise MissingExtraError(
             f"{path.suffix} films cannot be written here ({text:.200}): pip install 'cnpgen[benchmark]'"
@@ -95,7 +96,8 @@ def _renderer(execution: Execution) -> Iterator[Callable[[int], Image]]:
     )
     try:
         renderer = mujoco.Renderer(model, IMAGE_HEIGHT, IMAGE_WIDTH)
-    except Exception as error:  # MuJoCo, EGL and OSMesa raise different exceptions
+    except Exception as error:
+        # MuJoCo, EGL and OSMesa raise different exceptions
         text = " ".join(str(error).split())
         raise MachineError(
             f"this machine cannot draw without a screen ({text}): install the libraries of EGL, or of OSMesa with"

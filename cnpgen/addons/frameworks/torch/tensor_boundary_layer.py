@@ -107,10 +107,10 @@ class TensorBoundaryLayer:
         coupling = table[:, self._interior] @ response
         for _ in range(self._steps):
             q = torch.einsum("kc,ncj->jnk", table, path)
-            residual, jacobian = self._equalities(
-                q, poses.T[:, :, None]
-            )  # (m, N, K) and (n m, N, K)
-            rows = jacobian.reshape(q.shape[0], -1, *q.shape[1:])  # (n, m, N, K)
+            # (m, N, K) and (n m, N, K)
+            residual, jacobian = self._equalities(q, poses.T[:, :, None])
+            # (n, m, N, K)
+            rows = jacobian.reshape(q.shape[0], -1, *q.shape[1:])
             normal = (
                 torch.einsum("janx,jbny,xy->nxayb", rows, rows, coupling)
                 .flatten(3)

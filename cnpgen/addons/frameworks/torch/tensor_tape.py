@@ -53,9 +53,8 @@ def _compared(
 
 
 def _if_else_zero(condition: Value, value: Value) -> torch.Tensor:
-    return torch.where(
-        condition != 0, value, 0.0
-    )  # a product would turn 0 * inf into nan
+    # A product would turn 0 * inf into nan.
+    return torch.where(condition != 0, value, 0.0)
 
 
 def _guarded_quotient(a: Value, b: Value) -> torch.Tensor:
@@ -100,7 +99,8 @@ class TensorTape:
             (int(tape.a[k]), int(tape.b[k]))[: OPERATIONS[name]]
             for k, name in enumerate(names)
         ]
-        last: dict[int, int] = {}  # value -> the last operation that uses it
+        # Value -> the last operation that uses it.
+        last: dict[int, int] = {}
         for k in reversed(range(len(tape))):
             if names[k] == "OUTPUT" and int(tape.b[k]) in selected:
                 self._rows[selected.index(int(tape.b[k]))][int(tape.constant[k])] = (

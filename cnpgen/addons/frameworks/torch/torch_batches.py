@@ -123,9 +123,8 @@ class BatchDataset(data.IterableDataset[TensorBatch]):  # type: ignore[misc]
         # position had been set by then: a position set later has priority.
         if batches.worker_positions is None:
             batches.worker_positions = torch.full((MAX_WORKERS, 2), -1).share_memory_()
-        self._worker_positions = (
-            batches.worker_positions
-        )  # a worker's copy of the batches may lack them
+        # A worker's copy of the batches may lack them.
+        self._worker_positions = batches.worker_positions
 
     def __len__(self) -> int:
         return len(self.batches)

@@ -91,6 +91,5 @@ class ReadRows(Sequence[Tensors]):
         return self.rows
 
     def __getitem__(self, row: Any) -> Any:
-        return {
-            name: values[row] for name, values in self.fields.items()
-        }  # torch's IndexError ends iteration
+        # torch's IndexError ends iteration
+        return {name: values[row] for name, values in self.fields.items()}
