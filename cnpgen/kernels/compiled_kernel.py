@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from cnpgen.arrays import Array
 from cnpgen.errors import MachineError
 from cnpgen.kernels.call_text import CALL, PYTHON_FUNCTIONS
 from cnpgen.kernels.code_cache import (
@@ -22,7 +23,7 @@ from cnpgen.kernels.code_cache import (
     request_final,
     tape_key,
 )
-from cnpgen.kernels.kernel import Array, GridKernel, Kernel, check_arguments, check_grid
+from cnpgen.kernels.kernel import GridKernel, Kernel, check_arguments, check_grid
 from cnpgen.kernels.machine_code import LoadedCode, define_symbol
 from cnpgen.kernels.optimizer import Replacement, replacer
 from cnpgen.kernels.tape import Tape

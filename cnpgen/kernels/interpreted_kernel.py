@@ -9,8 +9,8 @@ from typing import Any
 
 import numpy as np
 
+from cnpgen.arrays import Array
 from cnpgen.kernels.kernel import (
-    Array,
     GridKernel,
     Kernel,
     axis_names,

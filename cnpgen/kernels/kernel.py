@@ -7,9 +7,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from cnpgen.arrays import Array
 from cnpgen.kernels.tape import Axes, GridSpec, Tape
-
-Array = NDArray[np.float64]
 
 
 class Kernel(ABC):

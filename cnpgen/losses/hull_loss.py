@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
-from numpy.typing import NDArray
 
+from cnpgen.arrays import AnyArray
 from cnpgen.errors import UsageError
 from cnpgen.kernels.collision.clearance_loss import load_clearance_loss
 from cnpgen.kernels.library import KernelLibrary
@@ -17,8 +15,6 @@ from cnpgen.problems.problem import Problem
 from cnpgen.robots.observation.primitives import scene_primitives
 from cnpgen.robots.robot import Robot
 from cnpgen.robots.scene import Scene
-
-Array = NDArray[Any]
 
 # Every fourth node; which ones depends on 16ths of the shift.
 NODE_STRIDE, SHIFTS = 4, 16
@@ -37,7 +33,11 @@ class HullLoss:
     """
 
     def __init__(
-        self, problem: Problem, robot: Robot, kernels: KernelLibrary, tightening: Array
+        self,
+        problem: Problem,
+        robot: Robot,
+        kernels: KernelLibrary,
+        tightening: AnyArray,
     ) -> None:
         constraint = problem.first(RobotClearance)
         if constraint is None:
@@ -54,9 +54,9 @@ class HullLoss:
 
     def add(
         self,
-        results: tuple[Array, Array, Array],
+        results: tuple[AnyArray, AnyArray, AnyArray],
         batch: PlanBatch,
-        weights: Array,
+        weights: AnyArray,
         table: BasisTable,
         *,
         shift: float,

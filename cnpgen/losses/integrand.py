@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from cnpgen.arrays import AnyArray
 from cnpgen.errors import UsageError
 from cnpgen.kernels.symbolic.linalg import dot
 from cnpgen.kernels.symbolic.symbolic_state import (
@@ -27,8 +28,6 @@ from cnpgen.problems.objectives import ObjectiveTerm
 from cnpgen.problems.problem import Problem
 from cnpgen.problems.published_rules import load_rules
 from cnpgen.robots.robot import Robot
-
-Array = NDArray[Any]
 
 
 @dataclass(frozen=True)
@@ -248,8 +247,8 @@ def time_varying_conditions(
 def relaxation_of(
     time_varying: Sequence[tuple[Constraint, Condition]],
     s: NDArray[np.float64],
-    start_tip: Array,
-) -> Array:
+    start_tip: AnyArray,
+) -> AnyArray:
     """Return the relaxation of the conditions of ``time_varying_conditions``, each in its unit, shape (values, K, N).
 
     It is that of motions that may start outside a constraint: at phases s, shape (K,),

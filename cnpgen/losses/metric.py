@@ -14,14 +14,14 @@ from dataclasses import dataclass
 from typing import Any, Literal
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from cnpgen.arrays import Array
 from cnpgen.errors import UsageError
 from cnpgen.problems.problem import Problem
 from cnpgen.schema.argument_types import check_fields, checked_arguments
 from cnpgen.schema.arguments import numbers
 
-Array = NDArray[np.float64]
 Kind = Literal["fixed", "ramped", "learned"]
 Average = Literal["mean", "median", "trimmed"]
 

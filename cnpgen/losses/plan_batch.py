@@ -2,16 +2,15 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from cnpgen.arrays import AnyArray
 from cnpgen.errors import UsageError
 from cnpgen.problems.problem import Problem
 from cnpgen.schema.arguments import numbers
 
-Array = NDArray[Any]
 PLANS_PER_BLOCK = 128  # their points fit into the cache
 MAX_VECTOR_LANES = 16
 
@@ -20,11 +19,11 @@ MAX_VECTOR_LANES = 16
 class PlanBatch:
     """N plans with their obstacle poses and start positions."""
 
-    path: Array  # path control points [rad], shape (N, C, n)
-    rate: Array  # rate control points [1/s], shape (N, R)
-    obstacle_poses: Array  # poses and sizes of the obstacles, shape (N, width)
+    path: AnyArray  # path control points [rad], shape (N, C, n)
+    rate: AnyArray  # rate control points [1/s], shape (N, R)
+    obstacle_poses: AnyArray  # poses and sizes of the obstacles, shape (N, width)
     # Positions of the tip at the start [m], shape (N, 3), float64, or None.
-    start_tip: Array | None
+    start_tip: AnyArray | None
     # Mask of the plans that are finite with positive rate control points, shape (N,).
     valid: NDArray[np.bool_]
 
@@ -41,7 +40,7 @@ class PlanBatch:
             self.valid[rows],
         )
 
-    def lanes(self, values: Array) -> Array:
+    def lanes(self, values: AnyArray) -> AnyArray:
         """Return values of shape (N, ...) as (..., lanes), with ones for invalid plans and padding."""
         n = len(values)
         # Whole vectors: kernels have no code for the remaining lanes then.
@@ -57,7 +56,7 @@ class PlanBatch:
             out[..., :n][..., ~self.valid] = 1
         return out
 
-    def samples(self, lanes: Array) -> Array:
+    def samples(self, lanes: AnyArray) -> AnyArray:
         """Return values of shape (..., lanes) as (N, ...), with nan for invalid plans."""
         values = np.moveaxis(lanes[..., : len(self)], -1, 0)
         if not self.valid.all():

@@ -10,8 +10,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from cnpgen.arrays import AnyArray
 from cnpgen.errors import UsageError, counted, nearest
 from cnpgen.kernels.kernel import GridKernel
 from cnpgen.kernels.library import Backend, choose_backend, problem_kernels
@@ -50,7 +51,6 @@ from cnpgen.schema.arguments import (
 )
 from cnpgen.store.dataset_spec import StoredProblem
 
-Array = NDArray[Any]
 FORMS = ("signed", "paper")
 MAX_LOSS_THREADS = 1024
 _BUILT = {"_gradient", "_values", "_time_varying", "_hulls"}
@@ -73,10 +73,10 @@ class LossValue:
             points, shape (N, R).
     """
 
-    total: Array
-    terms: Array
-    path_gradient: Array
-    rate_gradient: Array
+    total: AnyArray
+    terms: AnyArray
+    path_gradient: AnyArray
+    rate_gradient: AnyArray
 
     def __repr__(self) -> str:
         return f"<LossValue of {counted(len(self.total), 'plan')}, {self.terms.shape[1]} terms>"
@@ -205,8 +205,8 @@ class PlanLoss:
         return LossValue(total, terms, path_gradient, rate_gradient)
 
     def _evaluate(
-        self, batch: PlanBatch, weights: Array, *, shift: float, gradient: bool
-    ) -> tuple[Array, Array, Array]:
+        self, batch: PlanBatch, weights: AnyArray, *, shift: float, gradient: bool
+    ) -> tuple[AnyArray, AnyArray, AnyArray]:
         """Return terms and gradients of a batch, block by block; the gradients are empty if they are not requested."""
         spec, orders = self.problem.trajectory, self.problem.path_orders
         table = basis_table(
@@ -277,7 +277,9 @@ class PlanLoss:
         ]
         return self._time_varying if used and batch.start_tip is not None else []
 
-    def _splines(self, batch: PlanBatch, table: BasisTable) -> tuple[Array, Array]:
+    def _splines(
+        self, batch: PlanBatch, table: BasisTable
+    ) -> tuple[AnyArray, AnyArray]:
         """Return the path, shape (orders, nodes, n, N), and the rate, shape (orders - 1, nodes, N)."""
         nodes, orders = len(table.s), self.problem.path_orders
         points, n = batch.path.shape[1:]
@@ -292,12 +294,12 @@ class PlanLoss:
     def _integrate(
         self,
         batch: PlanBatch,
-        weights: Array,
+        weights: AnyArray,
         table: BasisTable,
         varying: list[tuple[Constraint, Condition]],
         *,
         gradient: bool,
-    ) -> tuple[Array, Array, Array]:
+    ) -> tuple[AnyArray, AnyArray, AnyArray]:
         """Return terms and gradients of a block, samples last.
 
         The gradients are empty if they are not requested.
@@ -336,7 +338,7 @@ class PlanLoss:
         varying: list[tuple[Constraint, Condition]],
         *,
         gradient: bool,
-    ) -> Array:
+    ) -> AnyArray:
         """Return the relaxation of the conditions with time-varying bounds, shape (values, K, lanes)."""
         kernel = self._kernel(gradient=gradient)
         out = np.zeros(
@@ -396,7 +398,7 @@ class PlanLoss:
             ]
         )
 
-    def checked_weights(self, weights: ArrayLike | Mapping[str, float]) -> Array:
+    def checked_weights(self, weights: ArrayLike | Mapping[str, float]) -> AnyArray:
         """Return weights in the order of the terms and in the loss's precision.
 
         Raises:

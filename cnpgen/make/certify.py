@@ -8,6 +8,7 @@ from typing import ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
+from cnpgen.arrays import Array
 from cnpgen.errors import RecipeError
 from cnpgen.kernels.library import problem_kernels
 from cnpgen.machine.threads import one_thread
@@ -18,13 +19,7 @@ from cnpgen.make.on_plan import (
     planner_boundary,
 )
 from cnpgen.make.recipe import DatasetRecipe
-from cnpgen.pipelines.stages.stage import (
-    Array,
-    CandidateBatch,
-    Context,
-    Stage,
-    StageFunction,
-)
+from cnpgen.pipelines.stages.stage import CandidateBatch, Context, Stage, StageFunction
 from cnpgen.plans.format import BOUNDARY
 from cnpgen.problems.problem import Problem
 from cnpgen.refine.refine_engine import Solver, load_solver

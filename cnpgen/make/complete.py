@@ -9,8 +9,9 @@ from functools import partial
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from cnpgen.arrays import Array
 from cnpgen.errors import DatasetError, UsageError, counted, nearest
 from cnpgen.kernels.library import choose_backend
 from cnpgen.make.goal_poses import MAX_GOAL_STATES, PoseTasks, problem_of_poses
@@ -32,8 +33,6 @@ from cnpgen.store.files.csv_table import read_csv_table
 from cnpgen.store.files.hdf5 import open_hdf5
 from cnpgen.store.files.kind import is_hdf5
 from cnpgen.store.paths import HDF5_KINDS, require_file
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from cnpgen.arrays import Array
 from cnpgen.errors import UsageError, lacks
 from cnpgen.pipelines.resting_states import RestingStates, seeds_of
 from cnpgen.plans.boundary_problems import plans_of_rows
@@ -31,8 +32,6 @@ from cnpgen.schema.units import PLAUSIBLE_MAX, suggested_unit
 from cnpgen.store.field import Field
 from cnpgen.world.pose_ik import PoseKinematics, PoseTolerance, solve_pose_ik
 from cnpgen.world.world import World
-
-Array = NDArray[np.float64]
 
 MAX_GOAL_STATES = 5  # of one task that are tried, the nearest first
 POSE_REASON = "no inverse kinematics of the goal"

@@ -7,13 +7,13 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from cnpgen.arrays import Array
 from cnpgen.errors import RecipeError
 from cnpgen.kernels.symbolic.kinematics import tip_position
 from cnpgen.machine.threads import one_thread
 from cnpgen.pipelines.stages.boundary_motion import onto_table, velocity_of_tip
 from cnpgen.pipelines.stages.draw import position_field
 from cnpgen.pipelines.stages.stage import (
-    Array,
     CandidateBatch,
     Context,
     Stage,

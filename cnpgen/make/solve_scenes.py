@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from cnpgen.arrays import Array
 from cnpgen.machine.times import NO_TIME, Times
 from cnpgen.make.goal_poses import (
     MAX_GOAL_STATES,
@@ -57,8 +58,6 @@ from cnpgen.schema.argument_types import check_fields, checked_arguments
 from cnpgen.schema.old_keywords import with_old_keywords
 from cnpgen.store.dataset_spec import StoredProblem
 from cnpgen.world.pose_ik import PoseKinematics
-
-Array = NDArray[np.float64]
 
 TOLERANCE_SEEDS = 256  # random states within the tolerances of a goal in collision
 POSE_EXPLANATION = f"{POSE_SEEDS} searches from random joint positions found none with the goal pose within the limits"

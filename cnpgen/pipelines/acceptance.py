@@ -12,11 +12,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from cnpgen.arrays import Array
 from cnpgen.kernels.symbolic.linalg import Scalar, Vec, dot, subtract, symbols
 from cnpgen.kernels.symbolic.symbolic_state import SymbolicState
 from cnpgen.pipelines.stages.collision import candidate_poses
 from cnpgen.pipelines.stages.scene_clearance import SceneClearance
-from cnpgen.pipelines.stages.stage import Array, CandidateBatch, Context, StageFunction
+from cnpgen.pipelines.stages.stage import CandidateBatch, Context, StageFunction
 from cnpgen.problems.conditions import symbolic_needs
 from cnpgen.problems.constraints.clearance import RobotClearance
 from cnpgen.problems.constraints.constraint import (

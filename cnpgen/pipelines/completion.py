@@ -4,6 +4,7 @@ from collections.abc import Collection, Iterable, Mapping
 
 import numpy as np
 
+from cnpgen.arrays import Array
 from cnpgen.errors import UsageError, lacks
 from cnpgen.kernels.symbolic.kinematics import tip_position
 from cnpgen.pipelines.acceptance import acceptance
@@ -15,7 +16,7 @@ from cnpgen.pipelines.pipeline import (
     stored_fields,
     written_columns,
 )
-from cnpgen.pipelines.stages.stage import Array, Context, TaskBatch
+from cnpgen.pipelines.stages.stage import Context, TaskBatch
 from cnpgen.problems.constraints.constraint import End
 from cnpgen.problems.constraints.puck_contact import PuckContact
 from cnpgen.problems.constraints.table import Table

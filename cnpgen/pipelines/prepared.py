@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from cnpgen.arrays import Array
 from cnpgen.errors import RecipeError, UsageError
 from cnpgen.kernels.library import Backend
 from cnpgen.pipelines.acceptance import acceptance
@@ -22,7 +23,7 @@ from cnpgen.pipelines.pipeline import (
     written_columns,
 )
 from cnpgen.pipelines.stages.draw_scenes import DrawScenes
-from cnpgen.pipelines.stages.stage import Array, CandidateBatch, load_context
+from cnpgen.pipelines.stages.stage import CandidateBatch, load_context
 from cnpgen.problems.constraints.constraint import BOUNDARY_TOLERANCES
 from cnpgen.store.field import Field
 from cnpgen.store.sampling_statistics import DensityMap, SamplingStatistics

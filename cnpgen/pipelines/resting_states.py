@@ -7,6 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from cnpgen.arrays import Array
 from cnpgen.errors import UsageError
 from cnpgen.problems.constraints.clearance import RobotClearance
 from cnpgen.problems.constraints.link_clearance import SelfClearance
@@ -16,8 +17,6 @@ from cnpgen.robots.robot import Robot
 from cnpgen.robots.solid import Solid, place_obstacles, solids_of
 from cnpgen.world.forward_kinematics import ForwardKinematics
 from cnpgen.world.rigid_bodies import RigidBodies
-
-Array = NDArray[np.float64]
 
 LINE_SPACING_RAD = 0.02  # rad or m, between checked states of a line
 

@@ -7,13 +7,11 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from cnpgen.arrays import Array
 from cnpgen.robots.obstacle import Obstacle
 from cnpgen.schema.argument_types import check_fields
 from cnpgen.schema.keys import Range, field
-
-Array = NDArray[np.float64]
 
 MAX_LENGTH_M = 10.0  # of furniture; larger lengths are probably in another unit
 

@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from cnpgen.arrays import Array
 from cnpgen.errors import UsageError
 from cnpgen.kernels.library import Backend, choose_backend, problem_kernels
 from cnpgen.machine.threads import one_thread
@@ -31,8 +32,6 @@ from cnpgen.schema.argument_types import checked_arguments
 from cnpgen.schema.arguments import check_choice, integer, number, numbers
 from cnpgen.store.dataset_spec import StoredProblem
 from cnpgen.trajectory.boundary import Boundary
-
-Array = NDArray[np.float64]
 
 # Number of path control points that the goal fixes.
 FIXED_AT_GOAL = {

@@ -17,8 +17,8 @@ with the smallest second differences is taken, so that motions stay smooth.
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from cnpgen.arrays import Array
 from cnpgen.kernels.symbolic.kinematics import forward_kinematics, tip_velocity
 from cnpgen.kernels.symbolic.linalg import Vec, add, dot, solve, symbols
 from cnpgen.problems.conditions import equality_residuals
@@ -26,8 +26,6 @@ from cnpgen.problems.problem import Problem
 from cnpgen.robots.robot import Robot
 from cnpgen.trajectory.spline import basis, clamped_knots, end_derivatives
 from cnpgen.trajectory.trajectory_spec import TrajectorySpec
-
-Array = NDArray[np.float64]
 
 CHANGE_WEIGHT = 0.05  # weight of the change relative to its second differences
 PROJECTION_DAMPING = 1e-6  # limits steps near singularities of the equalities

@@ -15,11 +15,10 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from functools import lru_cache, partial
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from cnpgen.arrays import AnyArray
 from cnpgen.kernels.kernel import Kernel
 from cnpgen.kernels.library import KernelLibrary
 from cnpgen.planner.control_point_functions import path_change, path_change_adjoint
@@ -34,8 +33,6 @@ from cnpgen.trajectory.boundary import (
 )
 from cnpgen.trajectory.trajectory_spec import TrajectorySpec
 
-Array = NDArray[Any]
-
 
 @dataclass(frozen=True)
 class ControlPoints:
@@ -46,8 +43,8 @@ class ControlPoints:
         rate: Control points of r [1/s], shape (N, R).
     """
 
-    path: Array
-    rate: Array
+    path: AnyArray
+    rate: AnyArray
 
     def __repr__(self) -> str:
         return (
@@ -56,7 +53,12 @@ class ControlPoints:
 
 
 def control_points(
-    tasks: Tasks, phi: Array, log_rate: Array, *, scale: float, spec: TrajectorySpec
+    tasks: Tasks,
+    phi: AnyArray,
+    log_rate: AnyArray,
+    *,
+    scale: float,
+    spec: TrajectorySpec,
 ) -> ControlPoints:
     """Compute control points in the dtype of the arguments; ``scale`` is the factor of phi [rad], the paper's pi.
 
@@ -84,11 +86,11 @@ def vjp(
     tasks: Tasks,
     points: ControlPoints,
     *,
-    path_gradient: Array,
-    rate_gradient: Array,
+    path_gradient: AnyArray,
+    rate_gradient: AnyArray,
     scale: float,
     spec: TrajectorySpec,
-) -> tuple[Array, Array]:
+) -> tuple[AnyArray, AnyArray]:
     """Convert gradients with respect to the control points to gradients with respect to the network's outputs.
 
     The gradients of ``points``, the result of ``control_points``, have shapes (N, C, n)
@@ -116,7 +118,7 @@ def vjp(
     return scale * interior.reshape(len(interior), math.prod(interior.shape[1:])), rates
 
 
-def lines_at_rest(boundary: Boundary, correction: Array) -> Array:
+def lines_at_rest(boundary: Boundary, correction: AnyArray) -> AnyArray:
     """Return control points of lines between states at rest, shape (N, C, n), plus corrections [rad], (N, m, n)."""
     start, goal = boundary.start_q[:, None], boundary.goal_q[:, None]
     interior = start + (goal - start) * along_line(correction.shape[1]) + correction
@@ -125,7 +127,7 @@ def lines_at_rest(boundary: Boundary, correction: Array) -> Array:
 
 
 @lru_cache(maxsize=16)
-def along_line(count: int, dtype: str = "float64") -> Array:
+def along_line(count: int, dtype: str = "float64") -> AnyArray:
     """Return the interior control points' fractions of the line from C_2 to C_{C-N_d}, shape (m, 1)."""
     return np.linspace(0, 1, count, dtype=dtype)[:, None]
 
@@ -144,7 +146,7 @@ class Projection:
     adjoint: Kernel
     interior: slice
 
-    def project(self, path: Array, obstacle_poses: Array) -> Array:
+    def project(self, path: AnyArray, obstacle_poses: AnyArray) -> AnyArray:
         """Return projected control points of paths [rad], shape (N, C, n).
 
         Boundary control points stay.
@@ -155,14 +157,16 @@ class Projection:
         inner += change.T.reshape(inner.shape)
         return projected
 
-    def vjp(self, path: Array, obstacle_poses: Array, gradient: Array) -> Array:
+    def vjp(
+        self, path: AnyArray, obstacle_poses: AnyArray, gradient: AnyArray
+    ) -> AnyArray:
         """Convert the gradient with respect to the result of ``project`` to that with respect to its argument."""
         # Chain rule of path + change(path): the gradient itself, and that through the
         # change.
         (through_change,) = self.adjoint(
             lanes(path), lanes(obstacle_poses), lanes(gradient[:, self.interior])
         )
-        total: Array = gradient + through_change.T.reshape(path.shape).astype(
+        total: AnyArray = gradient + through_change.T.reshape(path.shape).astype(
             gradient.dtype, copy=False
         )
         return total

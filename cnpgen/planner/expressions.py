@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from cnpgen.arrays import Array
 from cnpgen.kernels.library import KernelLibrary
 from cnpgen.kernels.symbolic.linalg import Vec, symbols
 from cnpgen.kernels.symbolic.symbolic_state import SymbolicState, time_derivatives
@@ -19,8 +20,6 @@ from cnpgen.problems.constraints.constraint import MIN_TOLERANCE, Condition
 from cnpgen.problems.constraints.joint import POWER_UNIT, JointTorque
 from cnpgen.problems.problem import Problem
 from cnpgen.robots.robot import Robot
-
-Array = NDArray[np.float64]
 
 
 def speed_residuals(robot: Robot, problem: Problem) -> Any:

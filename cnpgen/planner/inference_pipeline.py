@@ -11,6 +11,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from cnpgen.arrays import Array
 from cnpgen.kernels.kernel import GridKernel, Kernel
 from cnpgen.kernels.library import KernelLibrary, choose_backend, problem_kernels
 from cnpgen.kernels.tape import GridSpec
@@ -38,8 +39,6 @@ from cnpgen.store.scene_table import OBSTACLE_POSES
 from cnpgen.trajectory.boundary import Boundary, anchor_line
 from cnpgen.trajectory.spline import basis, chebyshev
 from cnpgen.trajectory.spline_motion import Motion
-
-Array = NDArray[np.float64]
 
 # In expected times, above which a motion nearer to the straight line may be faster.
 SLOW_DURATION = 1.8

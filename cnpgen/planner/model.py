@@ -16,8 +16,6 @@ from cnpgen.planner.tasks import Tasks
 from cnpgen.problems.problem_record import ProblemRecord
 from cnpgen.schema.argument_types import checked_arguments
 
-Array = NDArray[Any]
-
 MAX_NETWORK_ITERATIONS = 20
 
 

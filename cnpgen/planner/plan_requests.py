@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from cnpgen.arrays import Array
 from cnpgen.errors import DatasetError, UsageError
 from cnpgen.planner.model import Model
 from cnpgen.planner.planner import Planner
@@ -33,8 +34,6 @@ from cnpgen.store.files.documents import canonical_sha256
 from cnpgen.store.reader import open_dataset
 from cnpgen.store.scene_table import OBSTACLE_POSES, SCENE_ID
 from cnpgen.trajectory.boundary import Boundary
-
-Array = NDArray[np.float64]
 
 CERTIFIED_STAGE = "certified-plan"  # the stage that plans every sample
 

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from cnpgen.arrays import Array
 from cnpgen.errors import UsageError
 from cnpgen.machine.threads import one_thread
 from cnpgen.planner.inference_pipeline import loaded_problem, make_inference_pipeline
@@ -29,8 +30,6 @@ from cnpgen.trajectory.remaining_trajectory import (
     remaining_trajectory,
     with_finer_knots,
 )
-
-Array = NDArray[np.float64]
 
 GOAL_TOLERANCE = 1e-9  # rad, rad/s and rad/s^2: goals that differ by less are equal
 MIN_REMAINING_TIME_S = 1e-6  # motions that end sooner are not reused

@@ -4,8 +4,8 @@ from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
-from numpy.typing import NDArray
 
+from cnpgen.arrays import Array
 from cnpgen.errors import UsageError
 from cnpgen.kernels.kernel import Kernel
 from cnpgen.kernels.library import KernelLibrary
@@ -31,8 +31,6 @@ from cnpgen.robots.robot import Robot
 from cnpgen.robots.scene import Scene
 from cnpgen.robots.solid import place_obstacles
 from cnpgen.trajectory.boundary import Boundary
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

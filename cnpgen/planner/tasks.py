@@ -11,11 +11,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from cnpgen.arrays import AnyArray
 from cnpgen.robots.robot import Robot
 from cnpgen.robots.scene import Scene
 from cnpgen.trajectory.boundary import Boundary
-
-Array = NDArray[Any]
 
 MIN_EXPECTED_TIME_S = 0.2  # lower bound of ``expected_time``
 MIN_REACH_TIME_S = 0.03  # lower bound of ``reaching_time``
@@ -44,13 +43,13 @@ class Tasks:
     """
 
     boundary: Boundary
-    start_xyz: Array
-    goal_xyz: Array
-    expected_time: Array
+    start_xyz: AnyArray
+    goal_xyz: AnyArray
+    expected_time: AnyArray
     scene: Scene
-    correction: Array | None = None
+    correction: AnyArray | None = None
     placed: Scene | None = None
-    observation: Array | None = None
+    observation: AnyArray | None = None
 
     def __repr__(self) -> str:
         return f"<Tasks of shape {np.shape(self.boundary.start_q)}>"
@@ -59,7 +58,7 @@ class Tasks:
         return len(self.expected_time)
 
     @property
-    def obstacle_poses(self) -> Array:
+    def obstacle_poses(self) -> AnyArray:
         """Poses and sizes of all obstacles, as losses take them, shape (N, width)."""
         return (self.scene if self.placed is None else self.placed).poses
 
@@ -86,14 +85,14 @@ def lanes(values: NDArray[Any]) -> NDArray[np.float64]:
     )
 
 
-def rows(values: Array, n: int) -> Array:
+def rows(values: AnyArray, n: int) -> AnyArray:
     """Reshape (points n, N) to (N, points, n)."""
     return np.ascontiguousarray(values.T).reshape(
         values.shape[1], values.shape[0] // n, n
     )
 
 
-def ends_of(boundary: Boundary) -> Array:
+def ends_of(boundary: Boundary) -> AnyArray:
     """Return boundary conditions of N motions, shape (5 n, N), or (6 n, N) with goal_ddq."""
     return np.ascontiguousarray(
         np.concatenate(list(boundary.conditions().values()), axis=1).T
@@ -101,15 +100,15 @@ def ends_of(boundary: Boundary) -> Array:
 
 
 def expected_time(
-    boundary: Boundary, velocity_limit: Array, *, least: float = MIN_EXPECTED_TIME_S
-) -> Array:
+    boundary: Boundary, velocity_limit: AnyArray, *, least: float = MIN_EXPECTED_TIME_S
+) -> AnyArray:
     """Return the largest time that a joint needs at its velocity limit (authors' implementation, expected time) [s].
 
     Velocity limits [rad/s] have shape (n,) or (N, n), times shape (N,) and the lower
     bound ``least`` [s].
     """
-    joint_times: Array = np.abs(boundary.goal_q - boundary.start_q) / velocity_limit
-    time: Array = joint_times.max(axis=1, initial=least)
+    joint_times: AnyArray = np.abs(boundary.goal_q - boundary.start_q) / velocity_limit
+    time: AnyArray = joint_times.max(axis=1, initial=least)
     return time
 
 

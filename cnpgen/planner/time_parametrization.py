@@ -25,6 +25,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from cnpgen.arrays import Array
 from cnpgen.errors import UsageError
 from cnpgen.kernels.compiled_kernel import address_of, aligned_array
 from cnpgen.kernels.kernel import Kernel
@@ -38,8 +39,6 @@ from cnpgen.planner.time_scaling import PhaseGrid, blocks_of_motions, make_phase
 from cnpgen.problems.problem import Problem
 from cnpgen.robots.robot import Robot
 from cnpgen.trajectory.spline_motion import Motion
-
-Array = NDArray[np.float64]
 
 SOURCE = Path(__file__).with_name("time_parametrization.c")
 # Between phases; the 80 phases fill vectors of any width.

@@ -11,8 +11,8 @@ d / k^3``; a further value, at k = 4, determines it.
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from cnpgen.arrays import Array
 from cnpgen.kernels.kernel import Kernel
 from cnpgen.kernels.library import KernelLibrary
 from cnpgen.planner.expressions import (
@@ -26,8 +26,6 @@ from cnpgen.problems.problem import Problem
 from cnpgen.robots.robot import Robot
 from cnpgen.trajectory.spline import basis, chebyshev
 from cnpgen.trajectory.spline_motion import Motion, time_derivatives
-
-Array = NDArray[np.float64]
 
 MAX_TIME_SCALE = 3.0  # motions that need more are not usable plans
 POWER_BISECTIONS = 40  # of a time scale

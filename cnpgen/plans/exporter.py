@@ -12,12 +12,11 @@ from typing import ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
+from cnpgen.arrays import Array
 from cnpgen.plans.format import UNITS
 from cnpgen.robots.parameter_ranges import PARAMETER_UNITS
 from cnpgen.trajectory.joined import JoinedMotion
 from cnpgen.trajectory.spline_motion import Motion
-
-Array = NDArray[np.float64]
 
 TORQUE_COLUMNS = "joint_torque", "motor_torque"
 # Minimum length of the last step in steps; a shorter one is merged with the step

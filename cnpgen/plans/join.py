@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from cnpgen.arrays import Array
 from cnpgen.errors import UsageError
 from cnpgen.plans.format import NOTES, PlanStatus
 from cnpgen.plans.plans import Plans, check_made
@@ -18,8 +19,6 @@ from cnpgen.schema.argument_types import checked_arguments
 from cnpgen.schema.arguments import numbers
 from cnpgen.trajectory.boundary import join_boundaries
 from cnpgen.trajectory.joined import JoinedMotion
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from cnpgen.arrays import Array
 from cnpgen.errors import UsageError, counted
 from cnpgen.plans.format import FLOATS, INTEGERS, NOTES, PlanStatus
 from cnpgen.plans.plausible import check_boundary_units
@@ -27,8 +28,6 @@ from cnpgen.store.scene_table import OBSTACLE_POSES
 from cnpgen.trajectory.boundary import Boundary
 from cnpgen.trajectory.spline_motion import Motion, states_at_times
 from cnpgen.trajectory.trajectory_spec import MAX_CONTROL_POINTS, MAX_DEGREE
-
-Array = NDArray[np.float64]
 
 _NO_COLUMNS = {*FLOATS, *INTEGERS, "", "."}  # invalid names of columns
 

@@ -7,8 +7,8 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from cnpgen.arrays import Array
 from cnpgen.errors import UsageError
 from cnpgen.plans.plans import Plans, make_plans
 from cnpgen.problems.obstacles import Capacity, with_capacity
@@ -26,8 +26,6 @@ from cnpgen.schema.arguments import numbers
 from cnpgen.schema.units import suggested_unit
 from cnpgen.store.scene_table import OBSTACLE_POSES
 from cnpgen.trajectory.boundary import Boundary
-
-Array = NDArray[np.float64]
 
 # Capacities are multiples of it, so that scenes share compiled kernels.
 

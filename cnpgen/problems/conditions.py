@@ -10,7 +10,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from cnpgen.problems.constraints.constraint import Array, Condition
+from cnpgen.arrays import Array
+from cnpgen.problems.constraints.constraint import Condition
 from cnpgen.problems.problem import Problem
 from cnpgen.robots.robot import Robot
 from cnpgen.robots.solid import place_obstacles

@@ -5,6 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from cnpgen.arrays import Array
 from cnpgen.errors import RecipeError
 from cnpgen.problems.constraints.joint import JointTorque
 from cnpgen.problems.constraints.link_clearance import ObjectClearance
@@ -16,7 +17,6 @@ from cnpgen.robots.obstacle import Obstacle
 from cnpgen.robots.robot import Attached, Robot, read_model, recipe_errors_in
 from cnpgen.robots.scene import PARKED_POSITION_M
 from cnpgen.robots.shape.convex_part import turned
-from cnpgen.robots.shape.hull import Array
 from cnpgen.robots.shape.inline import unit_of_mesh
 from cnpgen.robots.shape.mesh_files import find_named_file
 from cnpgen.robots.shape.shape import Shape, load_held_shape, load_shape

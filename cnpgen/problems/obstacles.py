@@ -8,13 +8,13 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from cnpgen.arrays import Array
 from cnpgen.errors import UsageError
 from cnpgen.problems.constraints.clearance import RobotClearance
 from cnpgen.problems.problem import Problem
 from cnpgen.robots.observation.primitives import KINDS
 from cnpgen.robots.obstacle import Obstacle
 from cnpgen.robots.scene import PARKED_POSITION_M, Scene
-from cnpgen.robots.shape.hull import Array
 from cnpgen.robots.solid import place_obstacles
 from cnpgen.robots.table_frame import TableFrame, table_frame
 from cnpgen.schema.arguments import integer

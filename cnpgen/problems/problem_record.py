@@ -13,6 +13,7 @@ from functools import cached_property, lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
+from cnpgen.arrays import Array
 from cnpgen.errors import RecipeError, UsageError
 from cnpgen.problems.objectives import read_objective
 from cnpgen.problems.problem import FILES, Objective, Problem, resolved
@@ -22,7 +23,6 @@ from cnpgen.problems.problem_file import (
     restore_problem,
 )
 from cnpgen.robots.parameter_ranges import NO_PARAMETERS, ParameterRanges
-from cnpgen.robots.shape.hull import Array
 from cnpgen.robots.urdf import urdf_tree
 from cnpgen.schema.argument_types import checked_arguments
 from cnpgen.schema.arguments import concerning, numbers

@@ -15,8 +15,8 @@ from collections.abc import Generator, Iterator
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from cnpgen.arrays import Array
 from cnpgen.refine.grid_levels import MAX_INITIAL_VIOLATION
 from cnpgen.refine.refiner import Refiner
 from cnpgen.refine.rrt_connect import TreeSearch, find_paths
@@ -25,8 +25,6 @@ from cnpgen.refine.solver.sqp import Result
 from cnpgen.refine.task import MAX_JUDGED_VIOLATION, Attempt, Outcome, RefinementTask
 from cnpgen.trajectory.remaining_trajectory import with_fewer_knots, with_finer_knots
 from cnpgen.trajectory.spline_motion import Motion
-
-Array = NDArray[np.float64]
 
 # Tolerances; attempts with larger violations are left for joint-space paths.
 NEARLY_VALID = 30.0

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from cnpgen.arrays import Array
 from cnpgen.problems.problem import Problem
 from cnpgen.refine.solver.bounds import NO_TIGHTENING, bounds_template
 from cnpgen.refine.solver.grid import make_grid
@@ -17,7 +18,6 @@ from cnpgen.refine.solver.transcription import (
 from cnpgen.refine.task import RefinementTask
 from cnpgen.world.world import World
 
-Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 FINE_POINTS = 600
 PENETRATION_SCALE_M = 1e-4  # of violated distances without a tolerance of their own

@@ -15,6 +15,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from cnpgen.arrays import Array
 from cnpgen.errors import UsageError
 from cnpgen.machine.times import NO_TIME
 from cnpgen.plans.format import GOAL_OPTION
@@ -25,7 +26,6 @@ from cnpgen.problems.problem_record import open_problem
 from cnpgen.refine.refinement import Refinement
 from cnpgen.refine.task import Attempt
 
-Array = NDArray[np.float64]
 # Called with plans finished and valid since the last call.
 Progress = Callable[[int, int], None]
 

@@ -1,15 +1,14 @@
 """Initial guesses without a plan: lines, a quintic polynomial, and fits to joint-space paths."""
 
 import numpy as np
-from numpy.typing import NDArray
 
+from cnpgen.arrays import Array
 from cnpgen.robots.solid import place_obstacles
 from cnpgen.trajectory.boundary import Boundary, anchor_line, assemble
 from cnpgen.trajectory.spline import basis
 from cnpgen.trajectory.trajectory_spec import TrajectorySpec
 from cnpgen.world.world import World
 
-Array = NDArray[np.float64]
 # First value of a rising rate; fraction of its rising control points.
 RISING_FRACTION, RISING_PHASE = 0.3, 0.3
 MIN_GUESS_DURATION_S = 0.3  # of motions between close configurations

@@ -3,8 +3,8 @@
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from cnpgen.arrays import Array
 from cnpgen.kernels.library import choose_backend, problem_kernels
 from cnpgen.plans.plans import Plans
 from cnpgen.problems.problem_record import open_problem
@@ -18,7 +18,6 @@ from cnpgen.refine.solver.residuals import (
 from cnpgen.schema import registry
 from cnpgen.schema.argument_types import checked_arguments
 
-Array = NDArray[np.float64]
 CONSTRAINT_POINTS = 8  # of the grid, whose nodes of the cost are used only
 
 

@@ -8,6 +8,7 @@ from threading import get_ident
 import numpy as np
 from numpy.typing import NDArray
 
+from cnpgen.arrays import Array
 from cnpgen.kernels.library import KernelLibrary
 from cnpgen.plans.plans import Plans
 from cnpgen.problems.obstacles import goal_velocities, scene_of
@@ -25,7 +26,6 @@ from cnpgen.trajectory.remaining_trajectory import is_finer
 from cnpgen.trajectory.spline_motion import Motion
 from cnpgen.trajectory.trajectory_spec import TrajectorySpec
 
-Array = NDArray[np.float64]
 Solver = Callable[..., tuple[Motion, NDArray[np.bool_]]]  # of ``load_solver``
 
 

@@ -8,8 +8,8 @@ from dataclasses import replace
 from threading import get_ident
 
 import numpy as np
-from numpy.typing import NDArray
 
+from cnpgen.arrays import Array
 from cnpgen.kernels.collision.collision_checker import load_collision_library
 from cnpgen.kernels.collision.tree_search import EqualityKernel
 from cnpgen.kernels.library import KernelLibrary, choose_backend, problem_kernels
@@ -57,7 +57,6 @@ from cnpgen.trajectory.boundary import Boundary
 from cnpgen.trajectory.trajectory_spec import TrajectorySpec
 from cnpgen.world.world import World
 
-Array = NDArray[np.float64]
 # Of an input plan that is used as initial guess; slower ones hardly change in a step.
 MAX_INPUT_DURATION_S = 60.0
 MIN_RATE_FRACTION = 1e-3  # of a plan's largest rate control point

@@ -16,6 +16,7 @@ from itertools import count, islice, pairwise
 import numpy as np
 from numpy.typing import NDArray
 
+from cnpgen.arrays import Array
 from cnpgen.kernels.collision.tree_search import (
     EqualityKernel,
     TreeSettings,
@@ -27,7 +28,6 @@ from cnpgen.refine.solver.transcription import ResidualKernels
 from cnpgen.refine.task import RefinementTask
 from cnpgen.robots.robot import Robot
 
-Array = NDArray[np.float64]
 # States (n, K) of an edge -> the leading valid ones, projected, (n, k).
 Follow = Callable[[Array], Array]
 

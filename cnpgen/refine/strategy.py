@@ -17,8 +17,8 @@ from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 
+from cnpgen.arrays import Array
 from cnpgen.judges.plans.judge import Judge
 from cnpgen.judges.plans.verdict import Reason, Verdict
 from cnpgen.problems.constraints.clearance import ObjectContact, RobotClearance
@@ -39,8 +39,6 @@ from cnpgen.robots.robot import Robot
 from cnpgen.robots.scene import Scene
 from cnpgen.trajectory.boundary import Boundary
 from cnpgen.trajectory.spline_motion import Motion
-
-Array = NDArray[np.float64]
 
 MAX_VERDICT_FEEDBACKS = 3  # of collisions of one attempt from the verdict to the solver
 # Valid attempts whose links touch something within the tolerance, before the search

@@ -6,15 +6,14 @@ from dataclasses import dataclass, replace
 from enum import IntEnum
 
 import numpy as np
-from numpy.typing import NDArray
 
+from cnpgen.arrays import Array
 from cnpgen.judges.plans.verdict import Reason
 from cnpgen.refine.solver.sqp import Deadline
 from cnpgen.robots.scene import Scene
 from cnpgen.trajectory.boundary import Boundary
 from cnpgen.trajectory.spline import basis
 
-Array = NDArray[np.float64]
 # Tolerances on the fine grid; attempts with larger ones are judged only without better
 # ones.
 MAX_JUDGED_VIOLATION = 3.0

@@ -5,8 +5,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from cnpgen.arrays import Array
 from cnpgen.errors import RecipeError
-from cnpgen.robots.shape.hull import Array
 
 if TYPE_CHECKING:
     import pinocchio as pin

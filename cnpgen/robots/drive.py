@@ -11,12 +11,10 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 
+from cnpgen.arrays import Array
 from cnpgen.robots.parameter_ranges import optional_key
 from cnpgen.schema.keys import PerJoint, field
-
-Array = NDArray[np.float64]
 
 MIN_REVERSAL_SPEED = 0.01  # rad/s; the verdict resolves reversals of 1 ms
 

@@ -8,13 +8,11 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from cnpgen.arrays import Array
 from cnpgen.errors import UsageError
 from cnpgen.schema.arguments import distinct
 from cnpgen.schema.keys import Range, field, keys
-
-Array = NDArray[np.float64]
 
 TABLE_PARAMETERS = ("table_height", "table_roll", "table_pitch")
 TABLE_BOUNDS = ("table_x_low", "table_x_high", "table_y_low", "table_y_high")

@@ -11,12 +11,12 @@ from xml.etree import ElementTree
 
 import numpy as np
 
+from cnpgen.arrays import Array
 from cnpgen.errors import RecipeError, listed, nearest
 from cnpgen.robots.chain import Chain, frame_of, name_links_uniquely
 from cnpgen.robots.drive import Drive
 from cnpgen.robots.parameter_ranges import NO_PARAMETERS, ParameterRanges
 from cnpgen.robots.robot_spec import Payload
-from cnpgen.robots.shape.hull import Array
 from cnpgen.robots.shape.shape import Shape
 from cnpgen.robots.urdf import number_in, urdf_tree
 from cnpgen.robots.urdf_parameters import (

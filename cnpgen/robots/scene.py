@@ -12,9 +12,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from cnpgen.arrays import Array
 from cnpgen.errors import UsageError, counted
 from cnpgen.robots.obstacle import Obstacle
-from cnpgen.robots.shape.hull import MAX_COORDINATE_M, Array
+from cnpgen.robots.shape.hull import MAX_COORDINATE_M
 from cnpgen.robots.solid import (
     Solid,
     number_slices,

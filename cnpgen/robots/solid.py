@@ -20,9 +20,10 @@ from itertools import accumulate, pairwise
 
 import numpy as np
 
+from cnpgen.arrays import Array
 from cnpgen.robots.obstacle import Obstacle
 from cnpgen.robots.shape.convex_part import PRISM_SIDES, prism, turned
-from cnpgen.robots.shape.hull import CUBE, Array, frame_along
+from cnpgen.robots.shape.hull import CUBE, frame_along
 from cnpgen.robots.shape.inline import corners_of
 from cnpgen.schema.keys import Range
 

@@ -7,8 +7,8 @@ from typing import Any
 
 import numpy as np
 
+from cnpgen.arrays import Array
 from cnpgen.robots.parameter_ranges import UPRIGHT_TURN, ParameterRanges
-from cnpgen.robots.shape.hull import Array
 
 
 @dataclass(frozen=True)

@@ -8,10 +8,10 @@ from xml.etree.ElementTree import Element
 
 import numpy as np
 
+from cnpgen.arrays import Array
 from cnpgen.errors import RecipeError, nearest
 from cnpgen.robots.chain import LINK_SUFFIX
 from cnpgen.robots.shape.convex_part import turned
-from cnpgen.robots.shape.hull import Array
 from cnpgen.robots.urdf import number_in, numbers_in
 
 if TYPE_CHECKING:

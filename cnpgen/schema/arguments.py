@@ -8,12 +8,11 @@ from contextlib import contextmanager
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from cnpgen.arrays import AnyArray
 from cnpgen.errors import RecipeError, UsageError, nearest
 from cnpgen.schema.units import suggested_unit
-
-Array = NDArray[Any]
 
 BYTES_PER_FLOAT = 8
 MIN_CHECKED_SIZE = 10_000_000  # floats from which on the available memory is measured
@@ -92,7 +91,7 @@ def numbers(
     dtype: str = "float64",
     *,
     differentiable: bool = False,
-) -> Array:
+) -> AnyArray:
     """Return an argument as an array of "float64" or "float32"; accept nan and inf, and tensors on the CPU.
 
     Tensors with gradients are detached or, with ``differentiable``, raise an error.
@@ -115,7 +114,7 @@ def numbers(
         if array.dtype == dtype:
             return array
         with np.errstate(over="ignore"):
-            real: Array = array.real.astype(dtype, copy=False)
+            real: AnyArray = array.real.astype(dtype, copy=False)
     except (TypeError, ValueError, RuntimeError) as error:
         # The last from torch.
         uneven = "inhomogeneous" in str(error)
@@ -130,7 +129,7 @@ def numbers(
     return real
 
 
-def _fitting(name: str, array: Array) -> Array:
+def _fitting(name: str, array: AnyArray) -> AnyArray:
     """Return an array if a copy of it fits into memory: views that repeat values may be of any size."""
     if array.size > MIN_CHECKED_SIZE:
         check_memory(name, len(array), array.size)

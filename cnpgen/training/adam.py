@@ -7,12 +7,10 @@ it for a thousand steps.
 
 import math
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-Array = NDArray[Any]
+from cnpgen.arrays import AnyArray
 
 BETA_1, BETA_2, EPSILON = 0.9, 0.999, 1e-8
 # Small enough for the five arrays of a block to stay in the CPU cache.
@@ -31,13 +29,13 @@ class Adam:
     gradient.
     """
 
-    parameters: Array
-    average: Array
-    first: Array
-    second: Array
+    parameters: AnyArray
+    average: AnyArray
+    first: AnyArray
+    second: AnyArray
     step: int = 0
 
-    def update(self, gradient: Array, *, rate: float, memory: float = 0.999) -> None:
+    def update(self, gradient: AnyArray, *, rate: float, memory: float = 0.999) -> None:
         """Take one step at a learning rate.
 
         The decay ``memory`` of the average is smaller during the first steps.
@@ -61,8 +59,8 @@ class Adam:
     def _update_block(
         self,
         part: slice,
-        gradient: Array,
-        scratch: Array,
+        gradient: AnyArray,
+        scratch: AnyArray,
         *,
         factor: float,
         epsilon: float,
@@ -90,7 +88,7 @@ class Adam:
         average += work
 
 
-def start_adam(parameters: Array) -> Adam:
+def start_adam(parameters: AnyArray) -> Adam:
     """Return the initial state for parameters of shape (n_parameters,)."""
     return Adam(
         parameters,
@@ -120,7 +118,7 @@ class Clipping:
     sample: float = 0.0
     batch: float = 0.0
 
-    def sample_factors(self, norms: Array, *, limit: float) -> Array:
+    def sample_factors(self, norms: AnyArray, *, limit: float) -> AnyArray:
         """Return the factors of the samples' gradients, shape (N,), in (0, 1], from their finite norms.
 
         The largest norm is in running medians; inf for no clipping. Factors are 1 while

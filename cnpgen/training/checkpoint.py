@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from cnpgen.arrays import AnyArray
 from cnpgen.errors import DatasetError, UsageError
 from cnpgen.store.files.checksum_file import (
     Content,
@@ -30,7 +31,6 @@ from cnpgen.training.adam import Adam, Clipping, start_adam
 CHECKPOINT_KIND, CHECKPOINT_VERSION = "cnpgen-checkpoint", 2
 MIN_INTERVAL_S, MAX_INTERVAL_S = 20.0, 50.0  # wall time between two checkpoints
 INTERVAL_PER_WRITING_TIME = 20.0
-Array = NDArray[Any]
 _ADAM_ARRAYS = ("parameters", "average", "first", "second")
 _STATE_NUMBERS = ("steps", "imitating", "metric", "seconds", "checking")
 
@@ -44,18 +44,18 @@ class Sums:
     steps, which are not included in ``steps``.
     """
 
-    terms: Array
+    terms: AnyArray
     steps: int = 0
     lost: int = 0
     distance: float = 0.0
     imitating: int = 0
 
-    def add_distances(self, distances: Array) -> None:
+    def add_distances(self, distances: AnyArray) -> None:
         """Add the distances of a batch of imitating plans, shape (N, 1)."""
         self.distance += float(distances.mean(dtype=np.float64))
         self.imitating += 1
 
-    def add(self, terms: Array) -> None:
+    def add(self, terms: AnyArray) -> None:
         """Add the terms of a batch, shape (N, 1 + m).
 
         Plans without a finite loss are counted and omitted.
@@ -73,7 +73,7 @@ class Best:
 
     score: float
     step: int
-    parameters: Array
+    parameters: AnyArray
 
 
 @dataclass
@@ -101,7 +101,7 @@ class State:
 
 
 def start_state(
-    parameters: Array, *, terms: int, steps: int, imitation: float = 0.0
+    parameters: AnyArray, *, terms: int, steps: int, imitation: float = 0.0
 ) -> State:
     """Return the initial state of a run, a fraction of which imitates.
 

@@ -10,8 +10,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from cnpgen.arrays import Array
 from cnpgen.errors import DatasetError, UsageError
 from cnpgen.loader.dataset import Dataset
 from cnpgen.loader.load import load_dataset
@@ -27,8 +27,6 @@ from cnpgen.store.dataset_spec import StoredProblem
 from cnpgen.store.scene_table import OBSTACLE_POSES
 from cnpgen.training.training_rows import TrainingProblems
 from cnpgen.trajectory.boundary import Boundary
-
-Array = NDArray[np.float64]
 
 # Columns of a certified dataset.
 DEMONSTRATION = "path_control_points", "rate_control_points"

@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from cnpgen.arrays import Array
 from cnpgen.errors import UsageError
 from cnpgen.machine.threads import one_thread
 from cnpgen.planner.inference_pipeline import (
@@ -16,8 +17,6 @@ from cnpgen.planner.model import Model
 from cnpgen.schema.arguments import integer
 from cnpgen.trajectory.boundary import Boundary
 from cnpgen.trajectory.spline_motion import Motion
-
-Array = NDArray[np.float64]
 
 CONFIGURATIONS_TRIED = 800  # half of them random, the others on plans without violation
 MAX_VIOLATING_PLANS = 500  # plans that candidates are compared on

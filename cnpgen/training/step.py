@@ -2,11 +2,10 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from cnpgen.arrays import AnyArray
 from cnpgen.losses.plan_loss import LossValue
 from cnpgen.planner.control_points import ControlPoints, Projection, control_points, vjp
 from cnpgen.planner.network.architecture import Architecture, backward, forward
@@ -16,9 +15,6 @@ from cnpgen.training.adam import Adam, Clipping
 from cnpgen.training.settings import TrainingSettings
 from cnpgen.training.training_rows import Rows
 from cnpgen.trajectory.trajectory_spec import TrajectorySpec
-
-Array = NDArray[Any]
-
 
 Loss = Callable[..., LossValue]
 
@@ -50,19 +46,19 @@ class Learner:
     loss: Loss
     settings: TrainingSettings
     projection: Projection | None = None
-    along: Callable[[Tasks, Array], Tasks] | None = None
+    along: Callable[[Tasks, AnyArray], Tasks] | None = None
     features: Features | None = None
 
     def gradient(
         self,
-        parameters: Array,
+        parameters: AnyArray,
         rows: Rows,
-        weights: Array,
+        weights: AnyArray,
         *,
         shift: float,
         clipping: Clipping,
-        out: Array,
-    ) -> Array:
+        out: AnyArray,
+    ) -> AnyArray:
         """Write the gradient of the mean loss of a batch with respect to all parameters, shape (n_parameters,).
 
         The constraint terms have weights of shape (m,); the quadrature nodes have a
@@ -85,8 +81,8 @@ class Learner:
         return self._gradient(parameters, rows, cost, clipping, out)
 
     def imitation_gradient(
-        self, parameters: Array, rows: Rows, *, clipping: Clipping, out: Array
-    ) -> Array:
+        self, parameters: AnyArray, rows: Rows, *, clipping: Clipping, out: AnyArray
+    ) -> AnyArray:
         """Write the gradient of the mean distance from demonstrations.
 
         Return the distances, shape (N, 1).
@@ -103,12 +99,12 @@ class Learner:
 
     def _gradient(
         self,
-        parameters: Array,
+        parameters: AnyArray,
         rows: Rows,
         cost: Callable[[Rows, ControlPoints], LossValue],
         clipping: Clipping,
-        out: Array,
-    ) -> Array:
+        out: AnyArray,
+    ) -> AnyArray:
         network, scale, part = (
             self.architecture.split(parameters),
             self.settings.path_scale,
@@ -144,7 +140,7 @@ class Learner:
                 rows = self._along(rows, projected.path)
         return value.terms
 
-    def _along(self, rows: Rows, path: Array) -> Rows:
+    def _along(self, rows: Rows, path: AnyArray) -> Rows:
         """Return the rows of the next iteration, whose lines are the paths of this one."""
         assert self.along is not None
         assert self.features is not None
@@ -157,7 +153,7 @@ class Learner:
 
     def _output_gradients(
         self, rows: Rows, points: ControlPoints, value: LossValue
-    ) -> tuple[Array, Array]:
+    ) -> tuple[AnyArray, AnyArray]:
         """Return the loss's gradients with respect to both heads."""
         by_path, by_rate = (
             gradient.astype(points.path.dtype, copy=False)
@@ -182,7 +178,9 @@ class Learner:
             self.projection.project(points.path, rows.tasks.scene.poses), points.rate
         )
 
-    def _factors(self, phi: Array, log_rate: Array, clipping: Clipping) -> Array:
+    def _factors(
+        self, phi: AnyArray, log_rate: AnyArray, clipping: Clipping
+    ) -> AnyArray:
         """Return the factors of the samples' gradients, shape (N, 1).
 
         A gradient that is not finite becomes 0.
@@ -198,7 +196,7 @@ class Learner:
         return (factors / len(factors))[:, None]
 
     def update(
-        self, adam: Adam, clipping: Clipping, gradient: Array, *, rate: float
+        self, adam: Adam, clipping: Clipping, gradient: AnyArray, *, rate: float
     ) -> None:
         """Clip the gradient of a batch and take an Adam step.
 

@@ -2,11 +2,11 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from cnpgen.arrays import AnyArray
 from cnpgen.loader.windows import Order
 from cnpgen.planner.control_points import ControlPoints
 from cnpgen.planner.network.features import Features, feature_blocks, fit_features
@@ -15,7 +15,6 @@ from cnpgen.planner.tasks import Tasks
 from cnpgen.robots.scene import Scene
 from cnpgen.trajectory.boundary import Boundary
 
-Array = NDArray[Any]
 PREPARED_ROWS_PER_BLOCK = 8192
 
 
@@ -24,7 +23,7 @@ class Rows:
     """N training rows: tasks, inputs of the network, shape (N, F), and control points of demonstrations or None."""
 
     tasks: Tasks
-    features: Array
+    features: AnyArray
     target: ControlPoints | None = None
 
     def __len__(self) -> int:
@@ -49,7 +48,7 @@ class TrainingProblems:
     """
 
     boundary: Boundary
-    obstacle_poses: Array | None = None
+    obstacle_poses: AnyArray | None = None
 
 
 def prepare_rows(
@@ -60,7 +59,7 @@ def prepare_rows(
     blocks: tuple[str, ...] | None = None,
     lines: Callable[[Boundary], Tasks] | None = None,
     dtype: str = "float32",
-    obstacle_poses: Array | None = None,
+    obstacle_poses: AnyArray | None = None,
 ) -> tuple[Rows, Features]:
     """Prepare rows in blocks, because temporary arrays take four times the memory of the result.
 
@@ -84,7 +83,7 @@ def prepare_rows(
         ),
         blocks or feature_blocks(boundary, placed=placed),
     )
-    arrays: dict[str, Array] = {}
+    arrays: dict[str, AnyArray] = {}
     for part, own in zip(parts, poses, strict=True):
         tasks = (
             prepare(boundary[part], obstacle_poses=own)
@@ -107,7 +106,7 @@ def prepare_rows(
     ), definition
 
 
-def _arrays(tasks: Tasks, features: Features, dtype: str) -> dict[str, Array]:
+def _arrays(tasks: Tasks, features: Features, dtype: str) -> dict[str, AnyArray]:
     """Return all arrays of a block of rows with one entry per task, by name."""
     arrays = tasks.boundary.arrays()
     parts = {

@@ -6,8 +6,8 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from cnpgen.arrays import AnyArray
 from cnpgen.errors import MachineError
 from cnpgen.losses.metric import Metric
 from cnpgen.losses.quadrature import rotating_shift
@@ -19,7 +19,6 @@ from cnpgen.training.log import TrainingLog
 from cnpgen.training.step import Learner
 from cnpgen.training.training_rows import Rows, StepRows
 
-Array = NDArray[Any]
 Watcher = Callable[[Mapping[str, Any]], None]
 
 LOG_LINES = 100  # per run
@@ -43,9 +42,9 @@ class Run:
     budgets: Mapping[str, float]
     rows: Rows
     metric: Metric
-    model: Callable[[Array], Model]
+    model: Callable[[AnyArray], Model]
     validate: Callable[[Model], Mapping[str, Any]]
-    initial_parameters: Array | None = None
+    initial_parameters: AnyArray | None = None
 
     def __post_init__(self) -> None:
         settings = self.learner.settings
@@ -74,7 +73,7 @@ class Run:
                     checkpoints.save(state)
 
     def _train_step(
-        self, state: State, gradient: Array, log: TrainingLog, watch: Watcher | None
+        self, state: State, gradient: AnyArray, log: TrainingLog, watch: Watcher | None
     ) -> None:
         """Take a step, and write the records that are due after it."""
         started = time.process_time()
@@ -85,7 +84,7 @@ class Run:
             if watch is not None:
                 watch(record)
 
-    def step(self, state: State, gradient: Array) -> None:
+    def step(self, state: State, gradient: AnyArray) -> None:
         """Take one step; ``gradient`` is a buffer of shape (n_parameters,)."""
         adam, step = state.adam, state.adam.step
         rows = self.rows.take(self.order.batch(step))
@@ -100,7 +99,7 @@ class Run:
             adam, state.clipping, gradient, rate=self._rate(state, step)
         )
 
-    def _gradient(self, state: State, rows: Rows, gradient: Array) -> None:
+    def _gradient(self, state: State, rows: Rows, gradient: AnyArray) -> None:
         """Write the gradient of the loss, and pass the terms of the batch to the metric."""
         progress = state.progress(state.adam.step)
         terms = self.learner.gradient(

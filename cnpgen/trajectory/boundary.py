@@ -16,12 +16,11 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from cnpgen.arrays import Array
 from cnpgen.errors import UsageError
 from cnpgen.schema.arguments import check_memory_of_rows, integer, numbers
 from cnpgen.trajectory.spline import EndDerivatives, end_derivatives
 from cnpgen.trajectory.trajectory_spec import TrajectorySpec
-
-Array = NDArray[np.float64]
 
 
 class Scaling(Protocol):

@@ -17,8 +17,9 @@ from functools import cache
 
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from cnpgen.arrays import Array
 from cnpgen.errors import UsageError
 from cnpgen.schema.argument_types import checked_arguments
 from cnpgen.schema.arguments import numbers
@@ -27,8 +28,6 @@ from cnpgen.trajectory.samples import checked_samples, resampled, sampled_bounda
 from cnpgen.trajectory.spline import basis, chebyshev, clamped_knots
 from cnpgen.trajectory.spline_motion import Motion, scaled_to_duration
 from cnpgen.trajectory.trajectory_spec import TrajectorySpec
-
-Array = NDArray[np.float64]
 
 ARC_LENGTH_FRACTIONS = (0.0, 0.3, 0.6, 0.9)  # of the arc length in the phase
 MIN_FIT_ERROR_RAD = 1e-6  # smaller errors count as equal, and the simplest r is chosen

@@ -5,13 +5,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from cnpgen.arrays import Array
 from cnpgen.errors import UsageError
 from cnpgen.trajectory.spline import end_derivatives
 from cnpgen.trajectory.spline_motion import Motion, States, states_at_times
-
-Array = NDArray[np.float64]
 
 # Rad, rad/s and rad/s^2: rounding error between a state and a motion that starts from
 # it.

@@ -9,14 +9,12 @@ is divided into two or three.
 from functools import cache
 
 import numpy as np
-from numpy.typing import NDArray
 
+from cnpgen.arrays import Array
 from cnpgen.trajectory.boundary import Boundary, assemble
 from cnpgen.trajectory.spline import basis, chebyshev
 from cnpgen.trajectory.spline_motion import Motion, scaled_to_duration
 from cnpgen.trajectory.trajectory_spec import TrajectorySpec
-
-Array = NDArray[np.float64]
 
 # Relative to the limits; smaller than the tolerances of problems.
 

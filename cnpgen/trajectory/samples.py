@@ -1,13 +1,12 @@
 """Time-sampled trajectories of other planners: checks, resampling, and estimation of their boundary conditions."""
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from cnpgen.arrays import Array
 from cnpgen.errors import UsageError
 from cnpgen.schema.arguments import numbers
 from cnpgen.trajectory.boundary import Boundary
-
-Array = NDArray[np.float64]
 
 # Of times, positions and velocities in SI units; powers of larger ones overflow.
 MAX_SAMPLE = 1e9

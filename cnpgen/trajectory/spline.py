@@ -13,7 +13,7 @@ from math import factorial, perm, prod
 import numpy as np
 from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from cnpgen.arrays import Array
 
 # Larger control points are scaled, because products of them would overflow.
 

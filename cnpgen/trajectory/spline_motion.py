@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from cnpgen.arrays import Array
 from cnpgen.errors import UsageError
 from cnpgen.schema.arguments import numbers
 from cnpgen.trajectory.boundary import MotionIndexError
@@ -26,7 +27,6 @@ from cnpgen.trajectory.spline import (
 )
 from cnpgen.trajectory.trajectory_spec import TrajectorySpec
 
-Array = NDArray[np.float64]
 MAX_BLOCK_VALUES = 16_384  # per temporary array, to fit into the cache
 # On [0, 1].
 _NODES, _WEIGHTS = (np.polynomial.legendre.leggauss(8) + np.array([[1.0], [0.0]])) / 2

@@ -10,12 +10,11 @@ from functools import cached_property, lru_cache
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from cnpgen.arrays import Array
 from cnpgen.robots.shape.hull import coal_hull
 from cnpgen.robots.solid import Solid
 
-Array = NDArray[np.float64]
 # Rotation matrix of shape (3, 3), and origin [m], shape (3,).
 Pose = tuple[Array, Array]
 

@@ -5,13 +5,12 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from cnpgen.arrays import Array
 from cnpgen.robots.shape.hull import CUBE, frame_along
 from cnpgen.robots.solid import Box, Solid, same_shape
 from cnpgen.world.certified import CertifiedDistance, ConvexBody, Pose, convex_body
 
-Array = NDArray[np.float64]
 Point = Sequence[float]
 
 # Coal's default tolerance of 1e-6 shows up in full in distances just above contact.

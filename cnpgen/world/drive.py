@@ -6,11 +6,9 @@ continuous; see ``cnpgen.robots.drive`` for the symbols.
 """
 
 import numpy as np
-from numpy.typing import NDArray
 
+from cnpgen.arrays import Array
 from cnpgen.robots.drive import Drive
-
-Array = NDArray[np.float64]
 
 
 def linear_torque(drive: Drive, torque: Array, dq: Array, ddq: Array) -> Array:

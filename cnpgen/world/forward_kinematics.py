@@ -7,14 +7,12 @@ compared with Pinocchio's own forward kinematics.
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
+from cnpgen.arrays import Array
 from cnpgen.errors import MachineError
 
 if TYPE_CHECKING:
     import pinocchio as pin
-
-Array = NDArray[np.float64]
 
 # Rows of a joint's coefficients: its origin, and its direction if it slides.
 _ORIGIN, _SLIDE = 3, 7

@@ -7,17 +7,14 @@ from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from cnpgen.arrays import Array
 from cnpgen.robots.chain import frame_of
 from cnpgen.robots.parameter_ranges import PAYLOAD_CENTRE, UPRIGHT_TURN
 from cnpgen.robots.robot import Robot, reduced_model
 
 if TYPE_CHECKING:
     import pinocchio as pin
-
-
-Array = NDArray[np.float64]
 
 
 class MeasuredParameters:

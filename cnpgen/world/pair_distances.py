@@ -12,9 +12,9 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
+from cnpgen.arrays import Array
 from cnpgen.world.certified import CertifiedDistance, PlacedBody
 
-Array = NDArray[np.float64]
 Indices = NDArray[np.intp]
 
 RESOLUTION = 1e-9  # m: tolerance of the smallest distance

@@ -12,14 +12,13 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
+from cnpgen.arrays import Array
 from cnpgen.robots.shape.hull import CUBE
 from cnpgen.robots.solid import Solid, place_obstacles
 from cnpgen.world.certified import PlacedBody, convex_body, placed_solid
 from cnpgen.world.forward_kinematics import ForwardKinematics
 from cnpgen.world.pair_distances import Indices, PairDistances
 from cnpgen.world.world import RobotWorld
-
-Array = NDArray[np.float64]
 
 _CACHED = ("tip_rotation", "torque", "_tip_motion")  # of one path
 _AT_ORIGIN = np.eye(3), np.zeros(3)

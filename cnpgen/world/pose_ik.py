@@ -10,10 +10,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from cnpgen.arrays import Array
 from cnpgen.robots.robot import Robot
 from cnpgen.world.forward_kinematics import ForwardKinematics, joint_motion
-
-Array = NDArray[np.float64]
 
 MAX_POSE_STEPS = 60
 MAX_POSE_STEP_RAD = 0.4  # rad or m, of any joint

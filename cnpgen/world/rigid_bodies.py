@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from cnpgen.arrays import Array
 from cnpgen.robots.shape.convex_part import Contacts
 from cnpgen.robots.shape.hull import ball_round
 from cnpgen.robots.shape.shape import Shape
@@ -13,7 +14,6 @@ from cnpgen.robots.solid import Solid, same_shape
 from cnpgen.world.certified import CertifiedDistance, PlacedBody, convex_body
 from cnpgen.world.pair_distances import PairDistances
 
-Array = NDArray[np.float64]
 Pairs = NDArray[np.intp]
 
 MAX_BLOCK_PRODUCTS = 65_536  # of corners and directions, per temporary array

@@ -8,8 +8,8 @@ from functools import cached_property
 from typing import Any, Generic, TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
 
+from cnpgen.arrays import Array
 from cnpgen.errors import RecipeError
 from cnpgen.robots.obstacle import Obstacle
 from cnpgen.robots.robot import Robot
@@ -20,7 +20,6 @@ from cnpgen.world.measured_parameters import MeasuredParameters
 from cnpgen.world.pair_distances import PairDistances
 from cnpgen.world.rigid_bodies import NO_HELD_SHAPE, NO_SHAPE, RigidBodies
 
-Array = NDArray[np.float64]
 Value = TypeVar("Value", float, Array)  # of one state, or of K states
 
 

@@ -10,7 +10,6 @@ from functools import lru_cache
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from cnpgen.addons.benchmark.pucks import ExecutedPrefix
 from cnpgen.addons.benchmark.results_file import answer_from_dict
@@ -24,6 +23,7 @@ from cnpgen.addons.trajectories.interpolate import interpolated
 from cnpgen.addons.trajectories.judge_family import FamilyJudge
 from cnpgen.addons.trajectories.sampled_trajectory import Trajectory
 from cnpgen.addons.trajectories.trajectory_verdict import ConditionDecision, Decision
+from cnpgen.arrays import Array
 from cnpgen.errors import UsageError
 from cnpgen.judges.plans.evaluated_trajectory import EvaluatedTrajectory
 from cnpgen.judges.plans.judge import reason_of
@@ -36,7 +36,6 @@ from cnpgen.plans.plans import Plans
 from cnpgen.problems.problem_record import ProblemRecord, open_problem
 from cnpgen.world.path import PathWorld
 
-Array = NDArray[np.float64]
 Task = tuple[Plans, dict[str, Any], ExecutedPrefix | None]
 """One boundary problem, the stored answer, and the executed prefix of a replanning scenario."""
 

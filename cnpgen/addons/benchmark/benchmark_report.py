@@ -11,7 +11,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from cnpgen.addons.benchmark.answers import Task, execution_of
 from cnpgen.addons.benchmark.hypothesis_tests import FIGURES, Values, values_of
@@ -19,6 +18,7 @@ from cnpgen.addons.benchmark.result_tables import failure_summaries, notes, tabl
 from cnpgen.addons.benchmark.run_suite import Benchmark
 from cnpgen.addons.benchmark.simulator.plant import Plant
 from cnpgen.addons.benchmark.simulator.rendering import save_film, save_picture
+from cnpgen.arrays import Array
 from cnpgen.errors import CnpgenError, MachineError
 from cnpgen.schema.argument_types import checked_arguments
 from cnpgen.store.files.atomic import write_file
@@ -27,8 +27,6 @@ from cnpgen.store.files.figure_file import new_figure, save_figure
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
-
-Array = NDArray[np.float64]
 
 MAX_FILM_FRAMES = 300  # less than 1 MB
 _STYLE = "body{font-family:sans-serif;max-width:75em;margin:2em auto}td,th{padding:.2em .8em;text-align:right}"

@@ -10,11 +10,9 @@ from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from cnpgen.addons.benchmark.simulator.executed import PLANE_TOLERANCE_M, succeeded
-
-Array = NDArray[np.float64]
+from cnpgen.arrays import Array
 
 FLAGS = {  # of a row; those from "at the goal, executed" on need an execution
     "planned": "a plan was found",

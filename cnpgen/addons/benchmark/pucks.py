@@ -11,8 +11,8 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
+from cnpgen.arrays import Array
 from cnpgen.errors import RecipeError
 from cnpgen.make.complete import complete
 from cnpgen.pipelines.pipeline import Pipeline
@@ -31,7 +31,6 @@ from cnpgen.schema.arguments import integer
 from cnpgen.schema.keys import Range, field
 from cnpgen.trajectory.spline_motion import Motion
 
-Array = NDArray[np.float64]
 State = tuple[Array, Array, Array]
 """Positions [rad], velocities [rad/s] and accelerations [rad/s^2] of N arms, shape (N, n) each."""
 

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from cnpgen.addons.deploy.c_text import number, table
 from cnpgen.addons.deploy.planner_parts import LANES, PlannerParts
+from cnpgen.arrays import Array
 from cnpgen.planner.network.architecture import Layer
 from cnpgen.planner.network.features import count_features
 from cnpgen.planner.time_parametrization import (
@@ -18,8 +19,6 @@ from cnpgen.planner.time_parametrization import (
 )
 from cnpgen.planner.time_scaling import MAX_TIME_SCALE, TIME_SCALE_MARGIN
 from cnpgen.trajectory.spline import basis, graded_edges, taylor_coefficients
-
-Array = NDArray[np.float64]
 
 BLOCK = 16  # outputs of a layer that are accumulated together
 INPUTS = 4  # of a layer that pass at once

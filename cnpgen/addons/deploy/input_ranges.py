@@ -10,14 +10,12 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
+from cnpgen.arrays import Array
 from cnpgen.planner.inference_pipeline import LoadedProblem
 from cnpgen.planner.model import Model
 from cnpgen.planner.plan_requests import read_rows
 from cnpgen.planner.task_preprocessor import make_task_preprocessor
-
-Array = NDArray[np.float64]
 
 MAX_DEVIATIONS = 6.0  # of inputs of a model that stores no ranges
 ROUNDING_TOLERANCE = (

@@ -6,7 +6,6 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from cnpgen.addons.deploy.check_functions import (
     checked,
@@ -16,6 +15,7 @@ from cnpgen.addons.deploy.check_functions import (
 )
 from cnpgen.addons.deploy.input_ranges import InputRanges
 from cnpgen.addons.deploy.task_functions import CONDITION_NAMES, task
+from cnpgen.arrays import Array
 from cnpgen.errors import UsageError
 from cnpgen.kernels.library import KernelLibrary
 from cnpgen.kernels.tape import Tape
@@ -43,8 +43,6 @@ from cnpgen.problems.problem import Problem
 from cnpgen.robots.parameter_ranges import RANGE_ROUNDING
 from cnpgen.robots.robot import Robot
 from cnpgen.trajectory.spline import chebyshev
-
-Array = NDArray[np.float64]
 
 LANES = 8  # phases that are evaluated together
 CHECK_INTERVALS = 39  # between phases, of models whose rates are not fitted

@@ -9,8 +9,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from cnpgen.arrays import Array
 from cnpgen.errors import RecipeError, UsageError, nearest
 from cnpgen.pipelines.resting_states import RestingStates, seeds_of
 from cnpgen.pipelines.scene_family import Grasp, Layout, SceneFamily
@@ -35,7 +35,6 @@ from cnpgen.store.dataset_spec import StoredProblem
 from cnpgen.world.pose_ik import PoseKinematics, solve_pose_ik
 from cnpgen.world.world import World
 
-Array = NDArray[np.float64]
 POSES_PER_GRASP = 24  # random rotations about the approach
 MAX_GRASPS = 8  # of one scene that are tried
 MAX_PAIRS = 24  # of a start and a goal that are tried for one problem

@@ -3,22 +3,20 @@
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from cnpgen.arrays import AnyArray
 from cnpgen.losses.plan_loss import PlanLoss
-
-Array = NDArray[Any]
 
 
 def evaluate(
     loss: PlanLoss,
-    path: Array,
-    rate: Array,
-    weights: Array,
+    path: AnyArray,
+    rate: AnyArray,
+    weights: AnyArray,
     *,
     gradient: bool,
     **options: Any,
-) -> tuple[Array, Array, Array, Array, Array]:
+) -> tuple[AnyArray, AnyArray, AnyArray, AnyArray, AnyArray]:
     """Evaluate N plans.
 
     A plan whose loss or gradient is not finite has gradients of 0. A gradient of nan

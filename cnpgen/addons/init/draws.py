@@ -6,6 +6,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from cnpgen.arrays import Array
 from cnpgen.errors import RecipeError
 from cnpgen.kernels.library import choose_backend
 from cnpgen.pipelines.pipeline import Pipeline
@@ -18,8 +19,6 @@ from cnpgen.robots.robot import Robot
 from cnpgen.robots.shape.link_pairs import LinkContact, body_of_part, joint_poses
 from cnpgen.schema.keys import Range
 from cnpgen.world.world import World
-
-Array = NDArray[np.float64]
 
 BASE_CANDIDATES = 4000  # random states; the base configuration is one of them
 LIMIT_SHARE = 0.1  # share of a joint's range at either end that is left out

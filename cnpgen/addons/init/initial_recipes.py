@@ -7,12 +7,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from cnpgen.addons.init.arm import Arm, ArmJoint, arm_notes, with_torques
 from cnpgen.addons.init.draws import comfortable_base, find_boxes
 from cnpgen.addons.init.joint_limits import StatedJointLimits
 from cnpgen.addons.init.link_overlaps import LinkOverlaps, resolve_overlaps
+from cnpgen.arrays import Array
 from cnpgen.errors import RecipeError
 from cnpgen.make.recipe import DatasetRecipe
 from cnpgen.pipelines.pipeline import Pipeline
@@ -37,8 +37,6 @@ from cnpgen.robots.drive import NO_DRIVE, DriveSpec
 from cnpgen.robots.robot import Robot
 from cnpgen.robots.robot_spec import LimitSpec, RobotSpec
 from cnpgen.schema.keys import PerJoint, Range
-
-Array = NDArray[np.float64]
 
 # Range of inverse kinematics guesses around the base configuration.
 GUESS_RANGE_RAD, GUESS_RANGE_M = 0.5, 0.1

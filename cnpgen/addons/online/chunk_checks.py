@@ -5,11 +5,12 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from cnpgen.addons.trajectories.refuted_limits import refuted_limits
 from cnpgen.addons.trajectories.sample_errors import SampleErrors
 from cnpgen.addons.trajectories.sampled_trajectory import Trajectory
+from cnpgen.arrays import Array
 from cnpgen.errors import UsageError
 from cnpgen.judges.plans.joint_limits import joint_limits
 from cnpgen.problems.constraints.joint import JointPosition
@@ -17,8 +18,6 @@ from cnpgen.problems.problem import Problem
 from cnpgen.robots.robot import Robot
 from cnpgen.schema.arguments import number, numbers
 from cnpgen.world.path import PathWorld
-
-Array = NDArray[np.float64]
 
 MIN_CHUNK_SAMPLES = 8  # of a chunk after the join: fewer have no reliable velocity
 MAX_DURATION = 1.2  # of a motion, in chunk lengths

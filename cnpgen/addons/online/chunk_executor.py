@@ -7,7 +7,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from cnpgen.addons.online.callers_clock import ROUNDING_S, CallersClock
 from cnpgen.addons.online.chunk_checks import (
@@ -23,6 +23,7 @@ from cnpgen.addons.online.chunk_progress import ChunkProgress
 from cnpgen.addons.online.plan_runtime import PlanRuntime, positive
 from cnpgen.addons.online.set_points import ChunkSetPoint
 from cnpgen.addons.online.switches import ChunkJoin, SwitchOutcome
+from cnpgen.arrays import Array
 from cnpgen.errors import UsageError
 from cnpgen.machine.threads import one_thread
 from cnpgen.plans.plausible import check_units_of_states
@@ -31,8 +32,6 @@ from cnpgen.problems.problem_record import as_record, open_problem
 from cnpgen.schema.argument_types import checked_arguments
 from cnpgen.schema.arguments import concerning, integer, number
 from cnpgen.store.dataset_spec import StoredProblem
-
-Array = NDArray[np.float64]
 
 NOISE_RAD = 1e-3
 RATES_HZ, TIMES_S = (0.1, 1000.0), (1e-3, 60.0)  # ranges of options

@@ -17,14 +17,12 @@ from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
-from numpy.typing import NDArray
 
 from cnpgen.addons.online.set_points import SetPoint
+from cnpgen.arrays import Array
 from cnpgen.trajectory.boundary import Boundary, assemble
 from cnpgen.trajectory.spline import basis, clamped_knots
 from cnpgen.trajectory.trajectory_spec import TrajectorySpec
-
-Array = NDArray[np.float64]
 
 BRAKING_SHARE = 0.24  # b, of the phase: D is 1.14 times the chunk
 RAMP_SHARE = 0.3  # of the phase, in which u changes from the running speed

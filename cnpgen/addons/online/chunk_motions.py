@@ -6,10 +6,10 @@ from dataclasses import dataclass, replace
 from math import ceil
 
 import numpy as np
-from numpy.typing import NDArray
 
 from cnpgen.addons.online.chunk_fit import ChunkFit, chunk_fit
 from cnpgen.addons.online.set_points import SetPoint
+from cnpgen.arrays import Array
 from cnpgen.planner.expressions import speed_violation
 from cnpgen.planner.inference_pipeline import loaded_problem
 from cnpgen.planner.time_scaling import PhaseGrid
@@ -19,8 +19,6 @@ from cnpgen.trajectory.spline import basis, chebyshev
 from cnpgen.trajectory.spline_motion import Motion
 from cnpgen.trajectory.trajectory_spec import TrajectorySpec
 from cnpgen.world.certified import convex_body
-
-Array = NDArray[np.float64]
 
 POSITION_INSET_RAD = 5e-3  # of clipped positions: a smooth path overshoots its samples
 SPEED_STEP = 0.125  # between the speeds that are compared

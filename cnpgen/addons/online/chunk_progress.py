@@ -6,14 +6,12 @@ from collections import deque
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from cnpgen.addons.online.chunk_checks import SAMPLE_ROUNDING
 from cnpgen.addons.online.chunk_motions import ChunkMotion
 from cnpgen.addons.online.plan_runtime import PlanRuntime
+from cnpgen.arrays import Array
 from cnpgen.plans.plans import Plans
-
-Array = NDArray[np.float64]
 
 MAX_CHUNKS = 32  # that are kept
 

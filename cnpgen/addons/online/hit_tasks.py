@@ -4,8 +4,9 @@ import math
 from collections.abc import Mapping
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from cnpgen.arrays import Array
 from cnpgen.errors import UsageError
 from cnpgen.pipelines.completion import Completion
 from cnpgen.pipelines.pipeline import restore_pipeline
@@ -20,8 +21,6 @@ from cnpgen.plans.plausible import check_units_of_states
 from cnpgen.robots.plausible_values import MAX_LIMIT_RATIO, check_plausible
 from cnpgen.schema.arguments import check_memory_of_rows, concerning, numbers
 from cnpgen.trajectory.boundary import Boundary
-
-Array = NDArray[np.float64]
 
 HIT_COLUMNS = (
     "start_q",

@@ -15,13 +15,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cnpgen.addons.online.set_points import SampledMotion, parts_of
+from cnpgen.arrays import Array
 from cnpgen.judges.plans.measure import measure
 from cnpgen.plans.plans import Plans
 from cnpgen.problems.problem import Problem
 from cnpgen.problems.problem_record import ProblemRecord, open_problem
 from cnpgen.world.path import PathWorld
-
-Array = NDArray[np.float64]
 
 MAX_CHECK_STEP_S = 1e-3
 JERK_STEP_S = 1e-6  # of the difference quotient of accelerations

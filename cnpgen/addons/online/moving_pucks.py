@@ -22,6 +22,7 @@ from cnpgen.addons.online.hit_tasks import (
     lanes,
     state_lanes,
 )
+from cnpgen.arrays import Array
 from cnpgen.errors import UsageError
 from cnpgen.pipelines.completion import Completion
 from cnpgen.planner.planner import Planner, plan_tasks
@@ -35,7 +36,6 @@ from cnpgen.schema.argument_types import check_fields
 from cnpgen.schema.arguments import check_range, numbers
 from cnpgen.trajectory.spline import basis
 
-Array = NDArray[np.float64]
 HitArguments = tuple[
     State, ArrayLike, ArrayLike, ArrayLike, ArrayLike, ArrayLike | None
 ]

@@ -29,13 +29,12 @@ from cnpgen.addons.online.set_points import (
     joined_motions,
     sample_states,
 )
+from cnpgen.arrays import Array
 from cnpgen.plans.plans import Plans
 from cnpgen.problems.constraints.joint import JointAcceleration, JointTorque
 from cnpgen.problems.problem_record import open_problem
 from cnpgen.robots.robot import Robot
 from cnpgen.world.drive import friction_bounds
-
-Array = NDArray[np.float64]
 
 RAMPS = (0.1, 0.25, 0.45, 0.7)  # shares of the braking time in which w rises or falls
 NODE_STEP_S = 2e-3  # of the states at which limits are evaluated

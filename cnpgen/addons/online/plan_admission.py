@@ -6,7 +6,7 @@ import threading
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from cnpgen.addons.online.motion_check import MotionChecker
 from cnpgen.addons.online.plan_hits import PlannedHits
@@ -18,6 +18,7 @@ from cnpgen.addons.online.set_points import (
 )
 from cnpgen.addons.online.stops import with_smooth_end
 from cnpgen.addons.online.switches import SwitchOutcome
+from cnpgen.arrays import Array
 from cnpgen.errors import UsageError
 from cnpgen.judges.plans import Verdict
 from cnpgen.judges.plans.judge import Judge
@@ -28,7 +29,6 @@ from cnpgen.problems.problem_record import ProblemRecord, open_problem
 from cnpgen.robots.robot import Robot
 from cnpgen.schema.arguments import numbers
 
-Array = NDArray[np.float64]
 Executable = Plans | JoinedPlans | PlannedHits
 
 # Of q [rad]; of dq and ddq as fractions of the limits.

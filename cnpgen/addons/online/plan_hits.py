@@ -7,7 +7,7 @@ from typing import Any
 from weakref import WeakKeyDictionary
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from cnpgen.addons.online.hit_tasks import (
     State,
@@ -16,6 +16,7 @@ from cnpgen.addons.online.hit_tasks import (
     load_completion,
 )
 from cnpgen.addons.online.moving_pucks import MovingHits, PuckModel, plan_moving_hits
+from cnpgen.arrays import Array
 from cnpgen.errors import UsageError, counted
 from cnpgen.machine.threads import one_thread
 from cnpgen.pipelines.completion import Completion
@@ -28,8 +29,6 @@ from cnpgen.problems.problem_record import as_problem
 from cnpgen.schema.argument_types import check_fields, checked_arguments
 from cnpgen.schema.arguments import concerning, number, numbers
 from cnpgen.schema.old_keywords import CALLER, with_old_keywords
-
-Array = NDArray[np.float64]
 
 # From the centre of the paper's puck to that of its mallet at contact.
 

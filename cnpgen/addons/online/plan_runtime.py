@@ -9,7 +9,7 @@ from concurrent.futures import Future
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from cnpgen.addons.online.kept_stops import KeptStops
 from cnpgen.addons.online.motion_check import MotionChecker
@@ -24,6 +24,7 @@ from cnpgen.addons.online.set_points import (
 from cnpgen.addons.online.stops import earliest_stop
 from cnpgen.addons.online.switches import Stop, Switch, SwitchOutcome
 from cnpgen.addons.online.timeline import Timeline
+from cnpgen.arrays import Array
 from cnpgen.errors import CnpgenError, UsageError
 from cnpgen.planner.planner import Planner
 from cnpgen.plans.join import JoinedPlans
@@ -34,7 +35,6 @@ from cnpgen.schema.argument_types import checked_arguments
 from cnpgen.schema.arguments import concerning, distinct, number, numbers
 from cnpgen.store.dataset_spec import StoredProblem
 
-Array = NDArray[np.float64]
 PlanFunction = Callable[[SetPoint], Executable | None]
 """A function of the state at the switch that returns one plan, sequence or hit from there, or None."""
 

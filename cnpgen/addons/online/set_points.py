@@ -7,12 +7,11 @@ from math import ceil
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from cnpgen.arrays import Array
 from cnpgen.plans.join import JoinedPlans
 from cnpgen.plans.plans import Plans
-
-Array = NDArray[np.float64]
 
 MAX_GRID_STEP_S = 1e-3
 _QUINTIC = (

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 import numpy as np
-from numpy.typing import NDArray
 
 from cnpgen.addons.online.motion_check import MotionChecker
 from cnpgen.addons.online.path_timing import (
@@ -17,8 +16,6 @@ from cnpgen.addons.online.path_timing import (
     shapes,
 )
 from cnpgen.addons.online.set_points import SampledMotion
-
-Array = NDArray[np.float64]
 
 MAX_BRAKING_TIME_S = 1.5  # that is searched; slower motions continue to their end
 MIN_BRAKING_TIME_S = 4e-3

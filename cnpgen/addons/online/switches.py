@@ -6,9 +6,8 @@ from dataclasses import dataclass, field
 from enum import Enum
 
 import numpy as np
-from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from cnpgen.arrays import Array
 
 
 class SwitchOutcome(Enum):

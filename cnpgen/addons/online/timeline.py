@@ -5,13 +5,11 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 import numpy as np
-from numpy.typing import NDArray
 
 from cnpgen.addons.online.set_points import SampledMotion, SetPoint
+from cnpgen.arrays import Array
 from cnpgen.errors import UsageError
 from cnpgen.schema.arguments import distinct
-
-Array = NDArray[np.float64]
 
 CLOCK_ROUNDING_S = 1e-9  # by which equal times of a clock may differ
 

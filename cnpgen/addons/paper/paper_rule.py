@@ -18,8 +18,8 @@ these rules.
 from collections.abc import Iterator
 
 import numpy as np
-from numpy.typing import NDArray
 
+from cnpgen.arrays import Array
 from cnpgen.problems.constraints.axis import Vertical
 from cnpgen.problems.constraints.clearance import ObjectContact
 from cnpgen.problems.constraints.constraint import Constraint
@@ -32,8 +32,6 @@ from cnpgen.problems.constraints.table import Table
 from cnpgen.problems.problem import Problem
 from cnpgen.robots.solid import solids_of
 from cnpgen.world.path import PathWorld
-
-Array = NDArray[np.float64]
 
 MAX_GOAL_DISTANCE_M = 0.01  # goal radius of the paper's CBiRRT
 TABLE_TOLERANCE_M = 0.01

@@ -11,11 +11,10 @@ from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from cnpgen.arrays import AnyArray
 from cnpgen.errors import DatasetError, UsageError
 from cnpgen.machine.versions import __version__
 from cnpgen.planner.network.architecture import (
@@ -35,8 +34,6 @@ from cnpgen.store.files.checksum_file import (
     write_with_checksum,
 )
 from cnpgen.training.adam import learning_rate, start_adam
-
-Array = NDArray[Any]
 
 PROPOSALS_KIND, PROPOSALS_VERSION = "cnpgen-proposals", 1
 MIN_PROPOSAL_DEVIATION = 0.02  # fraction of the reach
@@ -61,20 +58,20 @@ class Proposals:
     """
 
     architecture: Architecture
-    parameters: Array
-    mean: Array
-    scale: Array
-    reach: Array
+    parameters: AnyArray
+    mean: AnyArray
+    scale: AnyArray
+    reach: AnyArray
     ahead: float
     training: Mapping[str, str] = field(default_factory=dict)
 
     def propose(
         self,
-        state: Array,
-        goal_q: Array,
-        obstacle_poses: Array,
+        state: AnyArray,
+        goal_q: AnyArray,
+        obstacle_poses: AnyArray,
         random: np.random.Generator,
-    ) -> Array:
+    ) -> AnyArray:
         """Sample a next configuration [rad], shape (n,), from a state of shape (2 n,) towards a goal of shape (n,)."""
         # Without the puck of a hit.
         poses = obstacle_poses[None, : len(self.mean) - 2 * len(state)]
@@ -92,14 +89,14 @@ class Proposals:
         return self.architecture.split(self.parameters)
 
 
-def inputs_of(states: Array, goal_q: Array, obstacle_poses: Array) -> Array:
+def inputs_of(states: AnyArray, goal_q: AnyArray, obstacle_poses: AnyArray) -> AnyArray:
     """Concatenate inputs: states (N, 2 n), goals (N, n), their differences, and obstacles (N, m)."""
     return np.concatenate(
         [states, goal_q, goal_q - states[:, : goal_q.shape[1]], obstacle_poses], axis=1
     )
 
 
-def standardize(inputs: Array, mean: Array, scale: Array) -> Array:
+def standardize(inputs: AnyArray, mean: AnyArray, scale: AnyArray) -> AnyArray:
     """Standardize inputs, shape (N, F), for the network."""
     return ((inputs - mean) * scale).astype(np.float32)
 
@@ -200,7 +197,7 @@ def train_proposals(
 
 def _training_rows(
     plans: Plans, ahead: float, random: np.random.Generator
-) -> tuple[Array, Array]:
+) -> tuple[AnyArray, AnyArray]:
     """Return inputs and the following changes of the joints [rad], at random times of all plans."""
     first = (
         random.uniform(0, 1, (len(plans), STATES_PER_PLAN)) * plans.duration[:, None]
@@ -222,11 +219,11 @@ def _training_rows(
 
 def _fit(
     network: Proposals,
-    features: Array,
-    targets: Array,
+    features: AnyArray,
+    targets: AnyArray,
     steps: int,
     random: np.random.Generator,
-) -> Array:
+) -> AnyArray:
     """Run all training steps; return the average of the last parameters."""
     adam, gradient = (
         start_adam(network.parameters.copy()),
@@ -248,7 +245,7 @@ def _fit(
 
 
 def likelihood_gradient(
-    weights: Weights, features: Array, targets: Array, *, out: Weights
+    weights: Weights, features: AnyArray, targets: AnyArray, *, out: Weights
 ) -> float:
     """Write the gradient of the mean negative logarithm of the likelihood; return this mean, up to the constant.
 

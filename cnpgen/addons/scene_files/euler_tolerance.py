@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from cnpgen.robots.shape.hull import Array
+from cnpgen.arrays import Array
 
 MAX_ANGLE = 0.5  # rad up to which the second-order bound below holds
 SECOND_ORDER = (

@@ -13,8 +13,9 @@ from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
 
+from cnpgen.arrays import Array
 from cnpgen.errors import RecipeError
-from cnpgen.problems.constraints.constraint import Array, Condition, LinkConstraint
+from cnpgen.problems.constraints.constraint import Condition, LinkConstraint
 from cnpgen.problems.scenes.placement import moved_obstacle
 from cnpgen.problems.scenes.quaternions import roll_pitch_yaw
 from cnpgen.robots.chain import frame_of

@@ -6,11 +6,12 @@ from typing import Any
 
 import numpy as np
 
+from cnpgen.arrays import Array
 from cnpgen.problems.scenes.quaternions import quaternion_error, rotation_matrix
 from cnpgen.problems.scenes.scene_problem import SceneError
 from cnpgen.problems.scenes.scene_request import BASE_FRAMES
 from cnpgen.problems.scenes.yaml_document import part, vector
-from cnpgen.robots.shape.hull import MAX_COORDINATE_M, Array
+from cnpgen.robots.shape.hull import MAX_COORDINATE_M
 from cnpgen.store.files.accounted import is_default, mark_read
 
 Pose = tuple[Array, Array]  # position [m] and rotation matrix

@@ -17,9 +17,9 @@ from cnpgen.addons.scene_files.moveit_frames import (
     rotation_of,
 )
 from cnpgen.addons.scene_files.moveit_shapes import primitive_kind, primitive_sizes
+from cnpgen.arrays import Array
 from cnpgen.problems.scenes.scene_problem import GoalPose, SceneError
 from cnpgen.problems.scenes.yaml_document import part, scalar, vector
-from cnpgen.robots.shape.hull import Array
 
 _PARAMETRIZATIONS = {"0": EULER, "XYZ_EULER_ANGLES": EULER}
 _PARAMETRIZATIONS |= {"1": ROTATION_VECTOR, "ROTATION_VECTOR": ROTATION_VECTOR}

@@ -9,11 +9,11 @@ from typing import Any
 import numpy as np
 
 from cnpgen.addons.scene_files.moveit_frames import Pose, composed, pose_of
+from cnpgen.arrays import Array
 from cnpgen.problems.scenes.quaternions import quaternion_of
 from cnpgen.problems.scenes.scene_problem import SceneError, make_mesh, make_obstacle
 from cnpgen.problems.scenes.yaml_document import part, vector
 from cnpgen.robots.obstacle import Obstacle
-from cnpgen.robots.shape.hull import Array
 
 # Codes of shape_msgs/SolidPrimitive.
 PRIMITIVES = {

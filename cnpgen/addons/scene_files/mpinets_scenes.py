@@ -18,6 +18,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from cnpgen.arrays import Array
 from cnpgen.problems.scenes.quaternions import quaternion_of
 from cnpgen.problems.scenes.scene_problem import (
     MAX_SCENES,
@@ -29,7 +30,6 @@ from cnpgen.problems.scenes.scene_problem import (
 from cnpgen.problems.scenes.scene_request import SceneRequest
 from cnpgen.robots.obstacle import Obstacle
 from cnpgen.robots.shape.convex_part import turned
-from cnpgen.robots.shape.hull import Array
 from cnpgen.store.files.accounted import Account, UnusedElements, accounted
 from cnpgen.store.files.hdf5 import Hdf5, create_hdf5, open_hdf5
 

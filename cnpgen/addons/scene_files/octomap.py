@@ -17,6 +17,7 @@ from cnpgen.addons.scene_files.moveit_frames import (
     frame_id,
     optional_pose,
 )
+from cnpgen.arrays import Array
 from cnpgen.errors import UsageError
 from cnpgen.problems.scenes.placement import moved_obstacle
 from cnpgen.problems.scenes.point_cloud import (
@@ -27,7 +28,6 @@ from cnpgen.problems.scenes.point_cloud import (
 from cnpgen.problems.scenes.scene_problem import MAX_SCENE_OBSTACLES, SceneError
 from cnpgen.problems.scenes.yaml_document import part, scalar, vector
 from cnpgen.robots.obstacle import Obstacle
-from cnpgen.robots.shape.hull import Array
 from cnpgen.schema.units import PLAUSIBLE_MAX
 from cnpgen.store.files.accounted import mark_read
 

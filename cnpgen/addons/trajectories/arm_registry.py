@@ -12,11 +12,9 @@ from importlib.resources import files
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from cnpgen.arrays import Array
 from cnpgen.errors import UsageError, either, nearest
-
-Array = NDArray[np.float64]
 
 VENDOR = "vendor"  # the basis of a limit that is a fact
 QUANTITIES = {"position": "rad", "velocity": "rad/s", "acceleration": "rad/s^2"}

@@ -8,12 +8,10 @@ explanations is that of the table ``_explanations``.
 from collections.abc import Iterator
 
 import numpy as np
-from numpy.typing import NDArray
 
 from cnpgen.addons.trajectories.sample_errors import SampleErrors
 from cnpgen.addons.trajectories.sampled_trajectory import Trajectory
-
-Array = NDArray[np.float64]
+from cnpgen.arrays import Array
 
 CONTRADICTION = "velocities are not the derivative of the positions"
 EXPLAINED_SHARE = 0.3  # of the difference, that may remain after a correction

@@ -12,10 +12,9 @@ from math import comb
 import numpy as np
 from numpy.typing import NDArray
 
+from cnpgen.arrays import Array
 from cnpgen.judges.plans.bernstein import PiecewisePolynomials
 from cnpgen.judges.plans.evaluated_trajectory import EvaluatedTrajectory
-
-Array = NDArray[np.float64]
 
 ORDERS = ("q", "dq", "ddq", "jerk")
 # Bound of a derivative that the curve does not have, in SI units; no real robot comes

@@ -14,7 +14,6 @@ from itertools import islice
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from cnpgen.addons.trajectories.arm_registry import (
     QUANTITIES,
@@ -30,8 +29,7 @@ from cnpgen.addons.trajectories.lower_bounds import (
     value_intervals,
 )
 from cnpgen.addons.trajectories.sample_errors import rounding, time_rounding
-
-Array = NDArray[np.float64]
+from cnpgen.arrays import Array
 
 NOMINAL_LAGS = (
     2  # distances in frames: a recorder that falls behind distorts longer ones

@@ -15,14 +15,13 @@ from cnpgen.addons.trajectories.trajectory_tables import (
     read_parquet,
     read_trajectory_tables,
 )
+from cnpgen.arrays import Array
 from cnpgen.errors import DatasetError, UsageError, listed
 from cnpgen.store.files.atomic import read_file
 from cnpgen.store.files.documents import parse_json
 from cnpgen.store.files.hdf5 import open_nested_hdf5
 from cnpgen.store.files.kind import HDF5_SUFFIXES
 from cnpgen.store.files.size_limits import MAX_TABLE_BYTES
-
-Array = NDArray[np.float64]
 
 STATE, ACTION = "observation.state", "action"
 ROBOMIMIC_KEY = "obs/robot0_joint_pos"

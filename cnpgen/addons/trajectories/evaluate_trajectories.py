@@ -28,6 +28,7 @@ from cnpgen.addons.trajectories.trajectory_verdict import (
     Statement,
     TrajectoryVerdict,
 )
+from cnpgen.arrays import Array
 from cnpgen.errors import UsageError, counted
 from cnpgen.judges.plans.judge import check_step
 from cnpgen.plans.evaluate import MAX_VERDICT_STEP_S, judged_in_parts
@@ -39,8 +40,6 @@ from cnpgen.robots.solid import pose_width
 from cnpgen.schema.argument_types import checked_arguments
 from cnpgen.schema.arguments import number, numbers
 from cnpgen.store.dataset_spec import StoredProblem
-
-Array = NDArray[np.float64]
 
 FORMAT = "cnpgen-trajectory-evaluation"
 TRAJECTORY_EVALUATION_VERSION = 1

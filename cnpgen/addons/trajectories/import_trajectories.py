@@ -19,6 +19,7 @@ from cnpgen.addons.trajectories.evaluate_trajectories import (
 )
 from cnpgen.addons.trajectories.sampled_trajectory import Trajectory
 from cnpgen.addons.trajectories.trajectory_scenes import problem_of_samples
+from cnpgen.arrays import Array
 from cnpgen.errors import UsageError
 from cnpgen.judges.plans.continuous_collision import is_contact
 from cnpgen.machine.threads import one_thread
@@ -38,7 +39,6 @@ from cnpgen.trajectory.spline_motion import Motion
 from cnpgen.trajectory.trajectory_spec import MAX_CONTROL_POINTS, TrajectorySpec
 from cnpgen.world.world import World
 
-Array = NDArray[np.float64]
 State = tuple[Array, Array, Array]
 
 # Of the positions at the samples, plus the noise, with more control points otherwise.

@@ -16,9 +16,9 @@ from numpy.typing import NDArray
 
 from cnpgen.addons.trajectories.curve_family import UNDEFINED, CurveFamily
 from cnpgen.addons.trajectories.sampled_trajectory import Trajectory
+from cnpgen.arrays import Array
 from cnpgen.errors import UsageError
 
-Array = NDArray[np.float64]
 Interpolation = Literal["hold", "linear", "cubic", "quintic"]
 
 INTERPOLATIONS = ("hold", "linear", "cubic", "quintic")

@@ -24,6 +24,7 @@ from cnpgen.addons.trajectories.trajectory_verdict import (
     TrajectoryVerdict,
 )
 from cnpgen.addons.trajectories.uncertainty import uncertainty_of
+from cnpgen.arrays import Array
 from cnpgen.judges.plans.bernstein import find_maximum
 from cnpgen.judges.plans.continuous_collision import (
     check_continuous_collision,
@@ -58,8 +59,6 @@ from cnpgen.robots.robot import Robot
 from cnpgen.robots.solid import pose_width
 from cnpgen.world.path import PathWorld
 from cnpgen.world.world import World
-
-Array = NDArray[np.float64]
 
 MIN_SPAN_PARTS = 2  # between two knots
 

@@ -15,7 +15,6 @@ from dataclasses import replace
 from functools import partial
 
 import numpy as np
-from numpy.typing import NDArray
 
 from cnpgen.addons.trajectories.contradicting_columns import (
     CONTRADICTION,
@@ -47,11 +46,10 @@ from cnpgen.addons.trajectories.trajectory_verdict import (
     TrajectoryVerdict,
 )
 from cnpgen.addons.trajectories.witness import witness
+from cnpgen.arrays import Array
 from cnpgen.judges.plans.bernstein import find_maximum
 from cnpgen.judges.plans.joint_limits import ProvenJointLimits, quantity_of
 from cnpgen.judges.plans.judge import MAX_STEP_S
-
-Array = NDArray[np.float64]
 
 # Between exact positions that a controller connects by lines.
 

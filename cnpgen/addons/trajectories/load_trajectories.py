@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from cnpgen.addons.trajectories.load_options import LoadOptions
 from cnpgen.addons.trajectories.sampled_trajectory import Trajectory
@@ -20,6 +19,7 @@ from cnpgen.addons.trajectories.table_units import plain
 from cnpgen.addons.trajectories.trajectory_scenes import problem_of_samples, with_scenes
 from cnpgen.addons.trajectories.trajectory_table import TrajectoryTable
 from cnpgen.addons.trajectories.trajectory_tables import read_trajectory_tables
+from cnpgen.arrays import Array
 from cnpgen.errors import UsageError, either, nearest
 from cnpgen.problems.problem import Problem
 from cnpgen.problems.problem_record import ProblemRecord, open_problem
@@ -30,8 +30,6 @@ from cnpgen.robots.robot import Robot
 from cnpgen.schema.argument_types import checked_arguments
 from cnpgen.schema.old_keywords import with_old_keywords
 from cnpgen.store.dataset_spec import StoredProblem
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)

@@ -13,9 +13,8 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from cnpgen.arrays import Array
 
 LAGS = (1, 2, 4, 8, 16, 32, 64)  # distances in samples
 ROUNDING = 8 * float(np.finfo(float).eps)  # relative error of positions in memory

@@ -9,7 +9,6 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from cnpgen.addons.trajectories.lower_bounds import (
     MeanDerivatives,
@@ -21,10 +20,9 @@ from cnpgen.addons.trajectories.lower_bounds import (
 )
 from cnpgen.addons.trajectories.sample_errors import SampleErrors
 from cnpgen.addons.trajectories.sampled_trajectory import Trajectory
+from cnpgen.arrays import Array
 from cnpgen.judges.plans.joint_limits import ProvenJointLimits, quantity_of
 from cnpgen.judges.plans.verdict import Margin
-
-Array = NDArray[np.float64]
 
 MIN_VIOLATION = 1.001  # in tolerances: rounding of the bounds proves nothing
 POSITIONS, VELOCITIES, BOTH = "positions", "velocities", "positions and velocities"

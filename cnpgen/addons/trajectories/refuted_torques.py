@@ -20,9 +20,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cnpgen.addons.trajectories.refuted_limits import RefutedLimit
+from cnpgen.arrays import Array
 from cnpgen.judges.plans.verdict import Margin
 
-Array = NDArray[np.float64]
 Torques = Callable[[Array, Array, Array], Array]  # of states, shape (K, n) each
 
 LAGS = (1, 2, 4, 8)

@@ -27,8 +27,7 @@ from cnpgen.addons.trajectories.smooth_curve import (
     NEIGHBORS,
     estimated_derivative,
 )
-
-Array = NDArray[np.float64]
+from cnpgen.arrays import Array
 
 # Samples that determine positions in a span, and fewer of them for the estimate of the
 # error.

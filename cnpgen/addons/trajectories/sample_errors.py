@@ -8,11 +8,9 @@ sensor, which numbers do not show.
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from cnpgen.addons.trajectories.sampled_trajectory import Trajectory
-
-Array = NDArray[np.float64]
+from cnpgen.arrays import Array
 
 EXACT_DECIMALS = 9  # numbers with so many are not rounded
 MIN_STEPS = 20  # changes of a value that show the step of an encoder

@@ -8,13 +8,11 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from cnpgen.arrays import Array
 from cnpgen.errors import UsageError
 from cnpgen.schema.arguments import numbers
 from cnpgen.trajectory.samples import checked_samples
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)

@@ -14,14 +14,12 @@ from math import factorial
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from cnpgen.addons.trajectories.curve_family import CurveFamily
 from cnpgen.addons.trajectories.interpolate import family_of_data
 from cnpgen.addons.trajectories.sampled_trajectory import Trajectory
+from cnpgen.arrays import Array
 from cnpgen.errors import UsageError
-
-Array = NDArray[np.float64]
 
 NEIGHBORS = 5  # samples whose positions and velocities determine an acceleration
 FEW_NEIGHBORS = 3  # of a second, less accurate estimate

@@ -7,7 +7,6 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from cnpgen.addons.trajectories.sampled_trajectory import Trajectory
 from cnpgen.addons.trajectories.table_columns import (
@@ -25,12 +24,11 @@ from cnpgen.addons.trajectories.table_units import (
     stated_factor,
 )
 from cnpgen.addons.trajectories.trajectory_table import TrajectoryTable
+from cnpgen.arrays import Array
 from cnpgen.errors import UsageError, listed, nearest
 from cnpgen.plans.format import PHASE_COLUMN
 from cnpgen.problems.problem_record import ProblemRecord
 from cnpgen.store.scene_table import OBSTACLE_POSES
-
-Array = NDArray[np.float64]
 
 MAX_RATE_DEVIATION = 0.01  # of a stated rate from that of the file's times, relative
 UNUSED_KINDS = ("jerk", "effort", "efforts")  # not reported as ignored

@@ -13,14 +13,12 @@ import re
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from cnpgen.addons.trajectories.sampled_trajectory import Trajectory
+from cnpgen.arrays import Array
 from cnpgen.errors import either
 from cnpgen.robots.plausible_values import UnitError
 from cnpgen.schema.units import UNITS
-
-Array = NDArray[np.float64]
 
 UNIT = re.compile(r"\s*\[(?!\d+\])([^\]]*)\]\s*$")  # "position[0]" has no unit
 DEGREE = float(np.pi / 180)

@@ -4,9 +4,9 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from cnpgen.addons.trajectories.sampled_trajectory import Trajectory
+from cnpgen.arrays import Array
 from cnpgen.judges.plans.plan_plot import PLOT_SAMPLES, draw_path, plot_times
 from cnpgen.judges.plans.verdict import Margin
 from cnpgen.problems.obstacles import scene_of
@@ -15,8 +15,6 @@ from cnpgen.robots.robot import Robot
 from cnpgen.robots.scene import Scene
 from cnpgen.robots.solid import place_obstacles
 from cnpgen.world.path import PathWorld
-
-Array = NDArray[np.float64]
 
 
 def plot_trajectory(

@@ -12,9 +12,9 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from cnpgen.addons.trajectories.sampled_trajectory import Trajectory
+from cnpgen.arrays import Array
 from cnpgen.errors import UsageError, counted, listed
 from cnpgen.make.recipe import load_dataset_recipe
 from cnpgen.plans.plan_file import load_plans
@@ -48,9 +48,6 @@ from cnpgen.schema.toml import Kind, read_table
 from cnpgen.store.files.kind import PLANS
 from cnpgen.store.paths import file_kind
 from cnpgen.store.scene_table import OBSTACLE_POSES
-
-Array = NDArray[np.float64]
-
 
 _KINDS: tuple[Kind, ...] = ("problem", "pipeline", "dataset")
 

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cnpgen.addons.trajectories.curve_family import UNDEFINED, CurveFamily
+from cnpgen.arrays import Array
 from cnpgen.judges.plans.continuous_collision import is_contact
 from cnpgen.judges.plans.evaluated_trajectory import EvaluatedTrajectory
 from cnpgen.judges.plans.measure import MeasuredCondition, measure
@@ -20,8 +21,6 @@ from cnpgen.problems.constraints.joint import POWER_UNIT, JointTorque
 from cnpgen.problems.problem import Problem
 from cnpgen.world.drive import friction_bounds
 from cnpgen.world.path import PathWorld
-
-Array = NDArray[np.float64]
 
 MAX_BLOCKS = 400  # of samples that share one error
 CURVATURE_FACTOR = 1.5  # on the sum of changes

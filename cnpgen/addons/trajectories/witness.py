@@ -17,8 +17,7 @@ from cnpgen.addons.trajectories.curve_family import CurveFamily
 from cnpgen.addons.trajectories.interpolate import data_of, family_of_data
 from cnpgen.addons.trajectories.sample_errors import SampleErrors
 from cnpgen.addons.trajectories.sampled_trajectory import Trajectory
-
-Array = NDArray[np.float64]
+from cnpgen.arrays import Array
 
 DEGREE = 5
 MIN_ERRORS = np.array([1e-9, 1e-7, 1e-5])  # of q, dq, ddq: agreement with exact samples

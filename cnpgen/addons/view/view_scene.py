@@ -5,7 +5,6 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from cnpgen.addons.trajectories.sampled_trajectory import Trajectory
 from cnpgen.addons.trajectories.trajectory_plot import along_trajectory
@@ -19,6 +18,7 @@ from cnpgen.addons.view.view_bodies import (
     tube,
     wrapped,
 )
+from cnpgen.arrays import Array
 from cnpgen.judges.plans.condition_curves import (
     ConditionCurve,
     condition_curves,
@@ -37,8 +37,6 @@ from cnpgen.robots.shape.hull import CUBE
 from cnpgen.robots.solid import pose_width
 from cnpgen.world.forward_kinematics import ForwardKinematics
 from cnpgen.world.path import PathWorld
-
-Array = NDArray[np.float64]
 
 FRAMES_PER_MOTION = 240
 # Of obstacles without a lower end, which are drawn down to the floor.

@@ -14,12 +14,11 @@ from itertools import accumulate, pairwise, product
 from math import comb
 
 import numpy as np
-from numpy.typing import NDArray
 
+from cnpgen.arrays import Array
 from cnpgen.judges.plans.scipy_splines import derivative_matrix
 from cnpgen.trajectory.spline_motion import Motion
 
-Array = NDArray[np.float64]
 Maximum = tuple[float, int, float]  # value, index of the function, phase
 
 LIMIT_DECISION_TOLERANCE = 1e-6  # error of a maximum that decides whether it is above 1

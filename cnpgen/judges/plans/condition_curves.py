@@ -7,6 +7,7 @@ from typing import cast
 import numpy as np
 from numpy.typing import NDArray
 
+from cnpgen.arrays import Array
 from cnpgen.judges.plans.joint_limits import is_proven
 from cnpgen.judges.plans.measure import MeasuredCondition, measure, name_part
 from cnpgen.problems.constraints.clearance import DistanceConstraint
@@ -14,8 +15,6 @@ from cnpgen.problems.constraints.joint import JointTorque
 from cnpgen.problems.problem import Problem
 from cnpgen.world.path import PathWorld
 from cnpgen.world.world import World
-
-Array = NDArray[np.float64]
 
 _UPRIGHT = "upright"  # the angle of "tilt" includes this condition
 _COSINE = "tilt cosine"  # drawn as an angle

@@ -20,6 +20,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from cnpgen.arrays import Array
 from cnpgen.judges.plans.evaluated_trajectory import Curve
 from cnpgen.judges.plans.measure import EvaluationContext, MeasuredCondition
 from cnpgen.judges.plans.verdict import Margin
@@ -27,8 +28,6 @@ from cnpgen.problems.constraints.clearance import DistanceConstraint
 from cnpgen.problems.constraints.constraint import Constraint
 from cnpgen.world.pair_distances import PairDistances
 from cnpgen.world.path import PathWorld
-
-Array = NDArray[np.float64]
 
 INTERVAL_PARTS = 8  # per subdivision
 MAX_INTERVALS = 256  # that are subdivided at a time

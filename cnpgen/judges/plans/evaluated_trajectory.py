@@ -9,8 +9,8 @@ from functools import lru_cache
 from typing import Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
+from cnpgen.arrays import Array
 from cnpgen.judges.plans.bernstein import bernstein_coefficients
 from cnpgen.judges.plans.scipy_splines import (
     basis_matrix,
@@ -19,7 +19,6 @@ from cnpgen.judges.plans.scipy_splines import (
 )
 from cnpgen.trajectory.spline_motion import Motion
 
-Array = NDArray[np.float64]
 # Derivatives of the path for accelerations, including order 0; jerks need one more.
 PATH_ORDERS = 3
 BOUND_PARTS = 4  # of every span, over which derivatives are bounded

@@ -7,6 +7,7 @@ from typing import cast
 import numpy as np
 from numpy.typing import NDArray
 
+from cnpgen.arrays import Array
 from cnpgen.judges.plans.bernstein import Maximum, PiecewisePolynomials, find_maximum
 from cnpgen.judges.plans.sampling import times
 from cnpgen.judges.plans.verdict import Margin
@@ -22,7 +23,6 @@ from cnpgen.store.joint_units import unit_of
 from cnpgen.world.path import PathWorld
 from cnpgen.world.world import World
 
-Array = NDArray[np.float64]
 Indices = NDArray[np.intp]
 
 MIN_RELATIVE_SCALE = 1e-9  # of a bound: resolution of violations if the tolerance is 0

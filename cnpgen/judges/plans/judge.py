@@ -10,8 +10,8 @@ from functools import lru_cache
 from itertools import chain
 
 import numpy as np
-from numpy.typing import NDArray
 
+from cnpgen.arrays import Array
 from cnpgen.errors import UsageError
 from cnpgen.judges.plans.bernstein import PiecewisePolynomials, knots, polynomials
 from cnpgen.judges.plans.continuous_collision import check_continuous_collision
@@ -53,8 +53,6 @@ from cnpgen.robots.scene import Scene
 from cnpgen.trajectory.boundary import Boundary
 from cnpgen.trajectory.spline_motion import Motion
 from cnpgen.world.path import PathWorld
-
-Array = NDArray[np.float64]
 
 MAX_STEP_S = 0.01  # with longer steps the samples miss most of the motion
 KINK_OFFSET = 1e-3  # in phase, between samples on either side of a kink

@@ -15,12 +15,12 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from cnpgen.arrays import Array
 from cnpgen.judges.plans.continuous_collision import is_contact
 from cnpgen.judges.plans.measure import EvaluationContext, MeasuredCondition
 from cnpgen.judges.plans.sampling import MIN_PHASE_STEP
 from cnpgen.judges.plans.verdict import Margin
 
-Array = NDArray[np.float64]
 Indices = NDArray[np.intp]
 
 # Relative to the tolerance: error of a maximum that decides about the verdict.

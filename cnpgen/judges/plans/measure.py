@@ -10,8 +10,8 @@ from functools import cached_property
 from typing import cast
 
 import numpy as np
-from numpy.typing import NDArray
 
+from cnpgen.arrays import Array
 from cnpgen.judges.plans.evaluated_trajectory import Curve, EvaluatedTrajectory
 from cnpgen.judges.plans.joint_limits import is_proven
 from cnpgen.judges.plans.sampling import Samples, times
@@ -31,8 +31,6 @@ from cnpgen.store.joint_units import unit_of
 from cnpgen.trajectory.boundary import Boundary
 from cnpgen.world.path import PathWorld
 from cnpgen.world.world import World
-
-Array = NDArray[np.float64]
 
 # Tolerances of the boundary conditions, with the units of revolute joints. Control
 # points that are rebuilt in float64 have errors of 1e-10; those kept in float32 have

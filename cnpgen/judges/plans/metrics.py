@@ -1,16 +1,14 @@
 """Metrics of plans, as defined in the paper's tables."""
 
 import numpy as np
-from numpy.typing import NDArray
 
+from cnpgen.arrays import Array
 from cnpgen.judges.plans.sampling import Samples
 from cnpgen.judges.plans.verdict import Metrics
 from cnpgen.problems.constraints.axis import Vertical
 from cnpgen.problems.constraints.table import Table
 from cnpgen.problems.problem import Problem
 from cnpgen.world.path import PathWorld
-
-Array = NDArray[np.float64]
 
 
 def metrics_of(

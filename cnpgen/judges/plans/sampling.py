@@ -5,12 +5,10 @@ from dataclasses import dataclass
 from functools import cache, lru_cache
 
 import numpy as np
-from numpy.typing import NDArray
 
+from cnpgen.arrays import Array
 from cnpgen.judges.plans.evaluated_trajectory import Phases
 from cnpgen.judges.plans.scipy_splines import basis_matrix
-
-Array = NDArray[np.float64]
 
 MIN_SAMPLES = 200  # per motion
 MAX_DURATION_S = 2000.0  # of a motion that is judged, for any time step

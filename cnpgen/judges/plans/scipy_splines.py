@@ -11,12 +11,11 @@ from math import factorial
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
+
+from cnpgen.arrays import Array
 
 if TYPE_CHECKING:
     from scipy.interpolate import BSpline
-
-Array = NDArray[np.float64]
 
 MAX_UNSCALED_RATE = 1e150  # 1/s; products of larger control points would overflow
 

@@ -20,8 +20,8 @@ from dataclasses import replace
 from typing import cast
 
 import numpy as np
-from numpy.typing import NDArray
 
+from cnpgen.arrays import Array
 from cnpgen.errors import UsageError
 from cnpgen.judges.plans.continuous_collision import is_contact
 from cnpgen.judges.plans.joint_limits import ProvenJointLimits
@@ -36,7 +36,6 @@ from cnpgen.schema.arguments import check_range
 from cnpgen.world.path import PathWorld
 from cnpgen.world.world import World
 
-Array = NDArray[np.float64]
 TrackingError = float | Sequence[float] | Array  # of every joint [rad], or one for all
 
 MAX_TRACKING_ERROR = 1.0  # rad or m

@@ -23,7 +23,8 @@ from typing import Any
 
 import numpy as np
 
-from cnpgen.judges.rows.row_report import Array, Check, Index, compare
+from cnpgen.arrays import Array
+from cnpgen.judges.rows.row_report import Check, Index, compare
 from cnpgen.problems.constraints.constraint import BOUNDARY_TOLERANCES
 from cnpgen.robots.robot import Robot
 from cnpgen.world.measured_parameters import MeasuredParameters

@@ -10,11 +10,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from cnpgen.arrays import Array
 from cnpgen.problems.constraints.constraint import End
 
 ENDS: tuple[End, End] = ("start", "goal")
 
-Array = NDArray[np.float64]
 Index = NDArray[np.int64]
 
 

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from cnpgen.arrays import Array
 from cnpgen.errors import DatasetError
 from cnpgen.judges.plans.judge import judge
 from cnpgen.judges.rows.hits import (
@@ -19,15 +20,7 @@ from cnpgen.judges.rows.hits import (
     judge_goals,
     velocity_factors,
 )
-from cnpgen.judges.rows.row_report import (
-    ENDS,
-    Array,
-    Check,
-    Index,
-    RowReport,
-    compare,
-    merge,
-)
+from cnpgen.judges.rows.row_report import ENDS, Check, Index, RowReport, compare, merge
 from cnpgen.problems.conditions import measured_needs
 from cnpgen.problems.constraints.constraint import BOUNDARY_TOLERANCES, Condition
 from cnpgen.problems.obstacles import goal_velocities, scene_of

@@ -7,13 +7,13 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from cnpgen.arrays import Array
 from cnpgen.robots.observation.primitives import KINDS, MESH, Primitives
 from cnpgen.robots.obstacle import Obstacle
 from cnpgen.robots.shape.hull import frame_along
 from cnpgen.robots.shape.inline import corners_of
 from cnpgen.robots.solid import number_slices, solids_of
 
-Array = NDArray[np.float64]
 Bodies = NDArray[np.void]
 
 HULL, BOX, CYLINDER = 0, 1, 2  # kinds in convex.c

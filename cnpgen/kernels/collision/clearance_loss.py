@@ -9,8 +9,8 @@ from ctypes import c_double, c_long, c_void_p
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
+from cnpgen.arrays import Array
 from cnpgen.errors import UsageError
 from cnpgen.kernels.collision.body_arrays import primitive_bodies
 from cnpgen.kernels.collision.collision_checker import (
@@ -34,8 +34,6 @@ if TYPE_CHECKING:
     import coal
 
     PlacedShape = tuple[coal.CollisionGeometry, coal.Transform3s]
-
-Array = NDArray[np.float64]
 
 
 def load_clearance_loss(

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from cnpgen.arrays import Array
 from cnpgen.kernels.collision.body_arrays import (
     BODY,
     Bodies,
@@ -25,8 +26,6 @@ from cnpgen.robots.obstacle import Obstacle
 from cnpgen.robots.robot import Robot
 from cnpgen.robots.shape.convex_part import Contacts
 from cnpgen.robots.shape.shape import Shape
-
-Array = NDArray[np.float64]
 
 _NAMES = (
     "convex.c",

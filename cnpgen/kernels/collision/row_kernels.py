@@ -9,11 +9,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from cnpgen.arrays import Array
 from cnpgen.kernels.collision.collision_checker import CollisionChecker
 from cnpgen.kernels.compiled_kernel import address_of, require_memory
 from cnpgen.kernels.kernel import Kernel
-
-Array = NDArray[np.float64]
 
 MAX_CONTACTS_PER_STATE = 4096
 NUMBERS_PER_CONTACT = 12  # in hull_rows.c

@@ -5,13 +5,11 @@ from ctypes import c_double, c_long, c_ulonglong, c_void_p
 from dataclasses import astuple, dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from cnpgen.arrays import Array
 from cnpgen.kernels.collision.collision_checker import CollisionChecker
 from cnpgen.kernels.compiled_kernel import address_of, require_memory
 from cnpgen.kernels.kernel import Kernel
-
-Array = NDArray[np.float64]
 
 MAX_PATH_POINTS = 2000
 STATES_PER_PROJECTION = 16  # BLOCK in manifold_search.c

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from cnpgen.arrays import Array
 from cnpgen.kernels.compiled_kernel import address_of, require_memory
 from cnpgen.kernels.library import KernelLibrary, choose_backend
 from cnpgen.robots.observation.camera import Camera
@@ -18,7 +19,6 @@ from cnpgen.robots.observation.observations import ObservationBackend
 from cnpgen.robots.observation.primitives import Primitives
 from cnpgen.robots.observation.surface_points import Seeds
 
-Array = NDArray[np.float64]
 Values = NDArray[np.float32]
 
 SOURCE = Path(__file__).with_name("observe.c")

@@ -9,6 +9,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
+from cnpgen.arrays import Array
 from cnpgen.kernels.collision.body_arrays import (
     BODY,
     BOX,
@@ -21,8 +22,6 @@ from cnpgen.robots.obstacle import Obstacle
 from cnpgen.robots.scene import make_scene_table, rotations_of, scene_poses
 from cnpgen.robots.shape.convex_part import PRISM_SIDES
 from cnpgen.store.scene_table import OBSTACLE_KINDS, SceneTable
-
-Array = NDArray[np.float64]
 
 # Of the radius of a cylinder that contains the prism of judges.
 _PRISM_FACTOR = 1 / np.cos(np.pi / PRISM_SIDES)

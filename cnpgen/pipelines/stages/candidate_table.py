@@ -4,7 +4,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from cnpgen.pipelines.stages.stage import Array, CandidateBatch, Context
+from cnpgen.arrays import Array
+from cnpgen.pipelines.stages.stage import CandidateBatch, Context
 from cnpgen.problems.constraints.table import Table
 from cnpgen.problems.obstacles import table_frame_of
 from cnpgen.robots import table_frame

@@ -16,17 +16,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from cnpgen.arrays import Array
 from cnpgen.errors import RecipeError
 from cnpgen.kernels.symbolic.linalg import symbols
 from cnpgen.kernels.symbolic.obstacle_distances import symbolic_solids
 from cnpgen.kernels.symbolic.symbolic_state import SymbolicState
-from cnpgen.pipelines.stages.stage import (
-    Array,
-    CandidateBatch,
-    Context,
-    Stage,
-    StageFunction,
-)
+from cnpgen.pipelines.stages.stage import CandidateBatch, Context, Stage, StageFunction
 from cnpgen.problems.constraints.clearance import ObjectContact, RobotClearance
 from cnpgen.problems.obstacles import scene_of, table_frame_of
 from cnpgen.problems.problem import Problem

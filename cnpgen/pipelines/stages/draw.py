@@ -6,16 +6,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from cnpgen.arrays import Array
 from cnpgen.errors import RecipeError
 from cnpgen.kernels.symbolic.kinematics import tip_position
 from cnpgen.pipelines.stages.candidate_table import in_world, in_world_box
-from cnpgen.pipelines.stages.stage import (
-    Array,
-    CandidateBatch,
-    Context,
-    Stage,
-    StageFunction,
-)
+from cnpgen.pipelines.stages.stage import CandidateBatch, Context, Stage, StageFunction
 from cnpgen.schema.keys import Range, field
 from cnpgen.store.field import Field
 

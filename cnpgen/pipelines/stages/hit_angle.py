@@ -4,16 +4,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from cnpgen.arrays import Array
 from cnpgen.errors import RecipeError
 from cnpgen.pipelines.stages.candidate_table import on_table
 from cnpgen.pipelines.stages.draw import position_field
-from cnpgen.pipelines.stages.stage import (
-    Array,
-    CandidateBatch,
-    Context,
-    Stage,
-    StageFunction,
-)
+from cnpgen.pipelines.stages.stage import CandidateBatch, Context, Stage, StageFunction
 from cnpgen.problems.constraints.puck_contact import PuckContact
 from cnpgen.problems.constraints.table import Table
 from cnpgen.schema.keys import field

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from cnpgen.arrays import Array
 from cnpgen.errors import RecipeError
 from cnpgen.kernels.kernel import Kernel
 from cnpgen.kernels.symbolic.linalg import Scalar, Vec, symbols
@@ -25,13 +26,7 @@ from cnpgen.pipelines.stages.hitting_newton import (
     objective,
 )
 from cnpgen.pipelines.stages.ik import IK_TOLERANCE, MAX_IK_STEPS, ik_step
-from cnpgen.pipelines.stages.stage import (
-    Array,
-    CandidateBatch,
-    Context,
-    Stage,
-    StageFunction,
-)
+from cnpgen.pipelines.stages.stage import CandidateBatch, Context, Stage, StageFunction
 from cnpgen.robots.robot import Robot
 from cnpgen.schema.keys import field
 from cnpgen.store.field import Field

@@ -19,6 +19,7 @@ from typing import Any
 
 import numpy as np
 
+from cnpgen.arrays import Array
 from cnpgen.errors import UsageError
 from cnpgen.kernels.symbolic.kinematics import forward_kinematics
 from cnpgen.kernels.symbolic.linalg import Scalar, Vec, cross, dot, symbols
@@ -29,7 +30,6 @@ from cnpgen.pipelines.stages.candidate_table import (
 )
 from cnpgen.pipelines.stages.hitting_newton import along, direction_symbols
 from cnpgen.pipelines.stages.stage import (
-    Array,
     CandidateBatch,
     Context,
     Stage,

@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from cnpgen.arrays import Array
 from cnpgen.kernels.kernel import Kernel
 from cnpgen.kernels.symbolic.kinematics import (
     bias_acceleration,
@@ -31,13 +32,7 @@ from cnpgen.kernels.symbolic.linalg import (
 )
 from cnpgen.kernels.tape import Loop
 from cnpgen.pipelines.stages.candidate_table import on_table, table_corners
-from cnpgen.pipelines.stages.stage import (
-    Array,
-    CandidateBatch,
-    Context,
-    Stage,
-    StageFunction,
-)
+from cnpgen.pipelines.stages.stage import CandidateBatch, Context, Stage, StageFunction
 from cnpgen.problems.constraints.table import Table
 from cnpgen.robots.robot import Robot
 from cnpgen.schema.keys import field

@@ -6,6 +6,7 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
+from cnpgen.arrays import Array
 from cnpgen.kernels.collision.body_arrays import (
     LANES,
     PADDING_DISTANCE_M,
@@ -19,7 +20,7 @@ from cnpgen.kernels.collision.collision_checker import (
 from cnpgen.kernels.compiled_kernel import address_of
 from cnpgen.pipelines.resting_states import RestingStates
 from cnpgen.pipelines.stages.batch_scenes import BatchScenes
-from cnpgen.pipelines.stages.stage import Array, Context
+from cnpgen.pipelines.stages.stage import Context
 from cnpgen.problems.constraints.clearance import RobotClearance
 from cnpgen.problems.constraints.link_clearance import SelfClearance
 from cnpgen.problems.problem import Problem

@@ -7,6 +7,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from cnpgen.arrays import Array
 from cnpgen.errors import RecipeError
 from cnpgen.kernels.kernel import Kernel
 from cnpgen.kernels.symbolic.kinematics import forward_kinematics, tip_position
@@ -17,7 +18,6 @@ from cnpgen.pipelines.stages.draw import position_field
 from cnpgen.pipelines.stages.ik import clip_to_limits, clipped_step
 from cnpgen.pipelines.stages.scene_clearance import SceneClearance
 from cnpgen.pipelines.stages.stage import (
-    Array,
     CandidateBatch,
     Context,
     Stage,

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from cnpgen.arrays import Array
 from cnpgen.errors import RecipeError, UsageError
 from cnpgen.kernels.library import Backend, KernelLibrary, problem_kernels
 from cnpgen.problems.constraints.constraint import Constraint
@@ -24,7 +25,6 @@ from cnpgen.store.field import Field
 if TYPE_CHECKING:
     from cnpgen.pipelines.stages.batch_scenes import BatchScenes
 
-Array = NDArray[np.float64]
 Kind = TypeVar("Kind", bound=Constraint)
 
 BLOCK_ROWS = 4096  # rows per block, unless a stage requires fewer

@@ -7,15 +7,13 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from cnpgen.arrays import AnyArray
 from cnpgen.errors import UsageError
 
-Array = NDArray[Any]
-Weights = tuple[tuple[Array, Array], ...]  # (W, b) of every layer
+Weights = tuple[tuple[AnyArray, AnyArray], ...]  # (W, b) of every layer
 
 
 @dataclass(frozen=True)
@@ -39,13 +37,13 @@ class Layer:
         """Offset of the next layer."""
         return self.start + (self.inputs + 1) * self.outputs
 
-    def weight(self, parameters: Array) -> Array:
+    def weight(self, parameters: AnyArray) -> AnyArray:
         """Return a view of W, shape (inputs, outputs), of a vector of all parameters."""
         return parameters[self.start : self.stop - self.outputs].reshape(
             self.inputs, self.outputs
         )
 
-    def bias(self, parameters: Array) -> Array:
+    def bias(self, parameters: AnyArray) -> AnyArray:
         """Return a view of b, shape (outputs,), of a vector of all parameters."""
         return parameters[self.stop - self.outputs : self.stop]
 
@@ -104,7 +102,7 @@ class Architecture:
         """All layers, in the order of the parameter vector."""
         return (*self.trunk, *self.heads)
 
-    def split(self, parameters: Array) -> Weights:
+    def split(self, parameters: AnyArray) -> Weights:
         """Return views of W and b of every layer, of a vector of all parameters, shape (n_parameters,)."""
         return tuple(
             (layer.weight(parameters), layer.bias(parameters))
@@ -119,7 +117,7 @@ class Architecture:
 
 def initial_parameters(
     architecture: Architecture, *, seed: int, head_scale: float, rate_bias: float
-) -> Array:
+) -> AnyArray:
     """Draw parameters by Glorot's uniform distribution; biases are zero except that of the time head.
 
     With small last layers, by the factor ``head_scale`` of both heads' last weights, an
@@ -155,13 +153,13 @@ class Activations:
         log_rate: The time head before its exponential, shape (N, rate_outputs).
     """
 
-    trunk: tuple[Array, ...]
-    path_hidden: Array
-    path: Array
-    log_rate: Array
+    trunk: tuple[AnyArray, ...]
+    path_hidden: AnyArray
+    path: AnyArray
+    log_rate: AnyArray
 
 
-def forward(weights: Weights, features: Array) -> Activations:
+def forward(weights: Weights, features: AnyArray) -> Activations:
     """Evaluate the network for inputs of shape (N, inputs), float32 or float64 as the weights."""
     *trunk_weights, hidden_weights, path_weights, (rate_weight, rate_bias) = weights
     trunk = [features]
@@ -175,9 +173,9 @@ def forward(weights: Weights, features: Array) -> Activations:
     )
 
 
-def _tanh_layer(layer: tuple[Array, Array], x: Array) -> Array:
+def _tanh_layer(layer: tuple[AnyArray, AnyArray], x: AnyArray) -> AnyArray:
     weight, bias = layer
-    y: Array = x @ weight
+    y: AnyArray = x @ weight
     y += bias
     np.tanh(y, out=y)
     return y
@@ -187,8 +185,8 @@ def backward(
     weights: Weights,
     activations: Activations,
     *,
-    path_gradient: Array,
-    log_rate_gradient: Array,
+    path_gradient: AnyArray,
+    log_rate_gradient: AnyArray,
     out: Weights,
 ) -> None:
     """Write the gradient of a scalar with respect to all weights to ``out``.
@@ -215,15 +213,17 @@ def backward(
             gradient = gradient @ weights[index][0].T
 
 
-def _through_tanh(gradient: Array, y: Array) -> Array:
+def _through_tanh(gradient: AnyArray, y: AnyArray) -> AnyArray:
     """Return the gradient before a tanh from that after it: times ``1 - y^2``."""
-    derivative: Array = y * y
+    derivative: AnyArray = y * y
     np.subtract(1.0, derivative, out=derivative)
     derivative *= gradient
     return derivative
 
 
-def _weight_gradient(x: Array, gradient: Array, out: tuple[Array, Array]) -> None:
+def _weight_gradient(
+    x: AnyArray, gradient: AnyArray, out: tuple[AnyArray, AnyArray]
+) -> None:
     """Write the gradient of a layer's weights from its input and the gradient of its output."""
     np.matmul(x.T, gradient, out=out[0])
     np.sum(gradient, axis=0, out=out[1])

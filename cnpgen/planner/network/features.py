@@ -11,8 +11,8 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from cnpgen.arrays import AnyArray
 from cnpgen.errors import UsageError
 from cnpgen.kernels.kernel import Kernel
 from cnpgen.kernels.library import KernelLibrary
@@ -26,8 +26,6 @@ from cnpgen.robots.shape.capsule import Capsule
 from cnpgen.trajectory.boundary import Boundary
 from cnpgen.trajectory.spline import basis
 from cnpgen.trajectory.trajectory_spec import TrajectorySpec
-
-Array = NDArray[Any]
 
 STATES = ("start_q", "start_dq", "start_ddq", "goal_q", "goal_dq")
 USUAL = (*STATES, "sin_cos", "tips", "expected_time")
@@ -60,10 +58,10 @@ class Features:
     """
 
     blocks: tuple[str, ...]
-    mean: Array
-    scale: Array
+    mean: AnyArray
+    scale: AnyArray
 
-    def of(self, tasks: Tasks, dtype: str = "float32") -> Array:
+    def of(self, tasks: Tasks, dtype: str = "float32") -> AnyArray:
         """Compute the features of N tasks, shape (N, F)."""
         raw = raw_features(tasks, self.blocks)
         raw -= self.mean
@@ -95,7 +93,7 @@ def feature_blocks(
 
 
 def published_features(
-    blocks: tuple[str, ...], velocity_limit: Array, acceleration_limit: Array
+    blocks: tuple[str, ...], velocity_limit: AnyArray, acceleration_limit: AnyArray
 ) -> Features:
     """Return states divided by pi and by the limits (paper, section on the neural network: normalized states).
 
@@ -136,7 +134,7 @@ def fit_features(parts: Iterable[Tasks], blocks: tuple[str, ...] = USUAL) -> Fea
     return Features(blocks, mean, scale)
 
 
-def raw_features(tasks: Tasks, blocks: tuple[str, ...]) -> Array:
+def raw_features(tasks: Tasks, blocks: tuple[str, ...]) -> AnyArray:
     """Compute features in their own units, float64, shape (N, F).
 
     * ``start_q`` to ``goal_dq``, and ``goal_ddq`` if it is given: the states [rad, rad/s, rad/s^2];
@@ -172,7 +170,7 @@ def count_features(
     return sum(widths[name] for name in blocks)
 
 
-def _block(tasks: Tasks, name: str) -> tuple[Array, ...]:
+def _block(tasks: Tasks, name: str) -> tuple[AnyArray, ...]:
     boundary = tasks.boundary
     if name in {*STATES, ARRIVAL, PARAMETERS}:
         return (getattr(boundary, name),)
@@ -247,11 +245,11 @@ class SceneFeatures:
     """
 
     points: Kernel
-    radii: Array
+    radii: AnyArray
     backend: ObservationBackend
-    path: Array
+    path: AnyArray
 
-    def __call__(self, path: Array, scene: Scene) -> Array:
+    def __call__(self, path: AnyArray, scene: Scene) -> AnyArray:
         """Compute the features of N paths, from control points [rad], shape (N, C, n), and the obstacles of each."""
         features = np.empty((len(path), count_scene_features(path.shape[2])))
         for first in range(0, len(path), TASKS_PER_BLOCK):
@@ -266,7 +264,7 @@ class SceneFeatures:
             )
         return features
 
-    def _along(self, path: Array, bodies: Primitives) -> Array:
+    def _along(self, path: AnyArray, bodies: Primitives) -> AnyArray:
         """Return the features along paths, shape (N, PATH_PHASES * (n + 2))."""
         count, _, n = path.shape
         # Central differences: the state itself, then each joint moved to both sides.

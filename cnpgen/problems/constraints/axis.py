@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from cnpgen.problems.constraints.constraint import Array, Condition, Constraint, End
+from cnpgen.arrays import Array
+from cnpgen.problems.constraints.constraint import Condition, Constraint, End
 from cnpgen.problems.constraints.tip_manifold import Vector, along, beside, unit
 from cnpgen.robots.parameter_ranges import UPRIGHT_TOLERANCE
 from cnpgen.schema.keys import field

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, Literal, Self
 import numpy as np
 from numpy.typing import NDArray
 
+from cnpgen.arrays import Array
 from cnpgen.schema.keys import field
 
 if TYPE_CHECKING:
@@ -16,7 +17,6 @@ if TYPE_CHECKING:
     from cnpgen.world.path import PathWorld
     from cnpgen.world.world import World
 
-Array = NDArray[np.float64]
 End = Literal["start", "goal"]
 
 MIN_TOLERANCE = 1e-9  # replaces a tolerance of zero in solvers and planners

@@ -9,7 +9,8 @@ from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
 
 import numpy as np
 
-from cnpgen.problems.constraints.constraint import Array, Condition, Constraint
+from cnpgen.arrays import Array
+from cnpgen.problems.constraints.constraint import Condition, Constraint
 from cnpgen.robots.drive import RIGID, Drive, SpeedLine
 from cnpgen.schema.keys import field
 from cnpgen.store.joint_units import units_of_joints

@@ -7,11 +7,12 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from cnpgen.arrays import Array
 from cnpgen.problems.constraints.clearance import (
     MAX_LINK_PENETRATION_M,
     DistanceConstraint,
 )
-from cnpgen.problems.constraints.constraint import Array, Condition, End
+from cnpgen.problems.constraints.constraint import Condition, End
 from cnpgen.schema.keys import field
 
 if TYPE_CHECKING:

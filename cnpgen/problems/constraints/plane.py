@@ -5,7 +5,7 @@ from functools import cached_property
 
 import numpy as np
 
-from cnpgen.problems.constraints.constraint import Array
+from cnpgen.arrays import Array
 from cnpgen.problems.constraints.tip_manifold import (
     BOUND_KINKS,
     TipManifold,

@@ -7,7 +7,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from cnpgen.problems.constraints.constraint import Array, Condition, End
+from cnpgen.arrays import Array
+from cnpgen.problems.constraints.constraint import Condition, End
 from cnpgen.problems.constraints.tip_manifold import TipManifold, TipRegion
 from cnpgen.schema.keys import Range, field
 

@@ -14,7 +14,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from cnpgen.problems.constraints.constraint import Array, Condition, Constraint, End
+from cnpgen.arrays import Array
+from cnpgen.problems.constraints.constraint import Condition, Constraint, End
 from cnpgen.schema.keys import field
 
 if TYPE_CHECKING:

@@ -13,7 +13,8 @@ from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 
-from cnpgen.problems.constraints.constraint import Array, Condition, Constraint, End
+from cnpgen.arrays import Array
+from cnpgen.problems.constraints.constraint import Condition, Constraint, End
 from cnpgen.schema.keys import Range
 
 if TYPE_CHECKING:

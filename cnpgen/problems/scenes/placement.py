@@ -8,6 +8,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from cnpgen.arrays import Array
 from cnpgen.errors import listed, nearest
 from cnpgen.problems.constraints.constraint import LinkConstraint
 from cnpgen.problems.scenes.quaternions import roll_pitch_yaw
@@ -26,7 +27,6 @@ from cnpgen.robots.chain import frame_of
 from cnpgen.robots.obstacle import Obstacle
 from cnpgen.robots.robot import Robot
 from cnpgen.robots.shape.convex_part import turned
-from cnpgen.robots.shape.hull import Array
 from cnpgen.robots.urdf import urdf_tree
 
 Pose = tuple[Array, Array]  # position [m] and rotation matrix

@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from cnpgen.arrays import Array
 from cnpgen.errors import UsageError, counted
 from cnpgen.problems.scenes.scene_problem import MAX_SCENE_OBSTACLES
 from cnpgen.robots.obstacle import Obstacle
-from cnpgen.robots.shape.hull import Array
 from cnpgen.schema.argument_types import checked_arguments
 from cnpgen.schema.arguments import check_range, integer, number, numbers
 from cnpgen.schema.units import PLAUSIBLE_MAX, suggested_unit

@@ -4,8 +4,8 @@ import math
 
 import numpy as np
 
+from cnpgen.arrays import Array
 from cnpgen.robots.scene import rotation_matrices
-from cnpgen.robots.shape.hull import Array
 
 MAX_NORM_ERROR = 0.01  # of a quaternion that is accepted and normalized
 

@@ -9,6 +9,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import ArrayLike
 
+from cnpgen.arrays import Array
 from cnpgen.errors import UsageError
 from cnpgen.problems.scenes.quaternions import (
     quaternion_error,
@@ -18,7 +19,7 @@ from cnpgen.problems.scenes.quaternions import (
 from cnpgen.problems.scenes.scene_request import NO_REQUEST, SceneRequest
 from cnpgen.robots.observation.primitives import KINDS, primitives_of, signed_distances
 from cnpgen.robots.obstacle import Obstacle, invalid_obstacle
-from cnpgen.robots.shape.hull import MAX_COORDINATE_M, Array, check_solid, hull_corners
+from cnpgen.robots.shape.hull import MAX_COORDINATE_M, check_solid, hull_corners
 from cnpgen.robots.shape.inline import address_of, is_inline
 from cnpgen.robots.solid import place_obstacles
 from cnpgen.schema.argument_types import check_fields, checked_arguments

@@ -7,9 +7,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from cnpgen.arrays import Array
 from cnpgen.problems.constraints.constraint import LinkConstraint
 from cnpgen.robots.obstacle import Obstacle
-from cnpgen.robots.shape.hull import Array
 from cnpgen.schema.argument_types import check_fields
 
 BASE_FRAMES = ("", "world")  # names of the frame of the robot's base

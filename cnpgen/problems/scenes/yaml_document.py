@@ -9,9 +9,9 @@ from typing import Any
 
 import numpy as np
 
+from cnpgen.arrays import Array
 from cnpgen.errors import requires_extra
 from cnpgen.problems.scenes.scene_problem import SceneError
-from cnpgen.robots.shape.hull import Array
 from cnpgen.store.files.atomic import read_file
 
 MAX_YAML_BYTES = 1 << 25

@@ -12,8 +12,8 @@ same boundary conditions, so that a violation is a proof for every motion.
 from collections.abc import Iterator
 
 import numpy as np
-from numpy.typing import NDArray
 
+from cnpgen.arrays import Array
 from cnpgen.problems.conditions import measured_needs
 from cnpgen.problems.constraints.constraint import Condition, Constraint
 from cnpgen.problems.constraints.joint import (
@@ -31,7 +31,6 @@ from cnpgen.trajectory.boundary import Boundary
 from cnpgen.world.drive import friction_bounds
 from cnpgen.world.world import World
 
-Array = NDArray[np.float64]
 # Relative to the bound, or absolute, by the derivative on which a condition depends:
 # more than the condition changes within the verdict's tolerances of boundary
 # conditions, 1e-6 rad, 1e-6 rad/s and 1e-4 rad/s^2.

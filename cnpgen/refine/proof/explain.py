@@ -12,7 +12,6 @@ from enum import StrEnum
 from itertools import chain
 
 import numpy as np
-from numpy.typing import NDArray
 
 from cnpgen.errors import UsageError
 from cnpgen.plans.plans import Plans
@@ -31,7 +30,6 @@ from cnpgen.schema.arguments import integer
 from cnpgen.store.joint_units import unit_of
 from cnpgen.trajectory.boundary import Boundary
 
-Array = NDArray[np.float64]
 # For motion between the times of the verdict, and its tolerance of boundary conditions.
 POSITION_MARGIN_RAD = 1e-4
 

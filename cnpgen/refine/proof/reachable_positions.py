@@ -3,8 +3,8 @@
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from cnpgen.arrays import Array
 from cnpgen.problems.constraints.joint import (
     JointAcceleration,
     JointPosition,
@@ -14,7 +14,6 @@ from cnpgen.problems.problem import Problem
 from cnpgen.robots.robot import Robot
 from cnpgen.trajectory.boundary import Boundary
 
-Array = NDArray[np.float64]
 NO_LIMIT = 1e6  # replaces a limit that the problem does not set
 DURATION_STEP_S = 1e-3  # of the search for the minimum duration
 # From an end; later, intervals are too wide to prove anything.

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from cnpgen.arrays import Array
 from cnpgen.problems.constraints.table import Table
 from cnpgen.problems.problem import Problem
 from cnpgen.refine.proof.reachable_positions import (
@@ -25,7 +26,6 @@ from cnpgen.refine.proof.tip_bound import ArmKinematics, bound_projection
 from cnpgen.robots.robot import Robot
 from cnpgen.trajectory.boundary import Boundary
 
-Array = NDArray[np.float64]
 MIN_VIOLATION_M = -0.01  # larger distances from the edge count as this one
 HEIGHT_WEIGHT = 10.0  # of a violation of the height, relative to the rectangle
 TIP_MARGIN_M = 5e-5  # for motion between the times of the verdict

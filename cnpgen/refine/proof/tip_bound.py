@@ -10,11 +10,10 @@ split. Every step gives a lower bound, so the result is a proof up to rounding.
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from cnpgen.arrays import Array
 from cnpgen.robots.robot import Robot
 
-Array = NDArray[np.float64]
 MAX_BOXES = 4000
 
 

@@ -16,6 +16,7 @@ from itertools import accumulate
 import numpy as np
 from numpy.typing import NDArray
 
+from cnpgen.arrays import Array
 from cnpgen.problems.conditions import measured_needs
 from cnpgen.problems.constraints.clearance import RobotClearance
 from cnpgen.problems.constraints.constraint import Condition, Constraint
@@ -26,7 +27,6 @@ from cnpgen.refine.solver.residuals import DISTANCE_SCALE_M, residual_scale
 from cnpgen.robots.solid import place_obstacles
 from cnpgen.world.world import World
 
-Array = NDArray[np.float64]
 # From either end, whose accelerations depend on the last rate control points.
 END_POINTS = 0, 1, 2, 4, 7, 11
 # Phases between which the relaxation of violated end bounds fades out.

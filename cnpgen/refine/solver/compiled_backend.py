@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from cnpgen.arrays import Array
 from cnpgen.kernels.compiled_kernel import CACHE_LINE_DOUBLES, address_of, aligned_array
 from cnpgen.kernels.library import KernelLibrary
 from cnpgen.refine.solver.bounds import Bounds
@@ -32,8 +33,6 @@ from cnpgen.refine.solver.qp_subproblem import (
 )
 from cnpgen.refine.solver.transcription import Transcription
 from cnpgen.trajectory.spline import end_derivatives
-
-Array = NDArray[np.float64]
 
 SOURCES = [Path(__file__).with_name(name) for name in ("active_set.c", "step.c")]
 MAX_LANES, ROWS_PER_BLOCK, TILE_POINTS = 8, 32, 8  # upper bounds of W, B and TILE in C

@@ -7,10 +7,10 @@ from itertools import permutations
 import numpy as np
 from numpy.typing import NDArray
 
+from cnpgen.arrays import Array
 from cnpgen.trajectory.spline import basis, chebyshev, graded_edges
 from cnpgen.trajectory.trajectory_spec import TrajectorySpec
 
-Array = NDArray[np.float64]
 Indices = NDArray[np.intp]
 NODES_PER_CELL = 4  # Gauss nodes of the time integral: relative error below 1e-9
 COST_NODES = 40

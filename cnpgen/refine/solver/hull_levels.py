@@ -10,8 +10,8 @@ at the neighboring points. Some are found by the verdict only, which names their
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from cnpgen.arrays import Array
 from cnpgen.kernels.collision.collision_checker import MAX_JOINTS
 from cnpgen.problems.problem import Problem
 from cnpgen.refine.solver.bounds import (
@@ -27,8 +27,6 @@ from cnpgen.robots.robot import Robot
 from cnpgen.trajectory.spline import basis
 from cnpgen.trajectory.trajectory_spec import TrajectorySpec
 from cnpgen.world.world import World
-
-Array = NDArray[np.float64]
 
 TEMPLATE_POINTS = 32  # of a grid that is only used to find equalities
 STATES_PER_INTERVAL = 10

@@ -21,6 +21,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from cnpgen.arrays import Array
 from cnpgen.kernels.collision.collision_checker import MAX_JOINTS, CollisionChecker
 from cnpgen.kernels.collision.row_kernels import DistanceColumns, RowKernels
 from cnpgen.kernels.kernel import Kernel
@@ -36,7 +37,6 @@ from cnpgen.robots.solid import solids_of
 from cnpgen.world.forward_kinematics import ForwardKinematics
 from cnpgen.world.rigid_bodies import RigidBodies
 
-Array = NDArray[np.float64]
 Pairs = NDArray[np.intp]
 LINK_CONSTRAINTS, OBJECT_CONSTRAINTS = (
     RobotClearance | SelfClearance,

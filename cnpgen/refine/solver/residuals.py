@@ -5,8 +5,8 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from cnpgen.arrays import Array
 from cnpgen.kernels.symbolic.linalg import symbols
 from cnpgen.kernels.symbolic.symbolic_state import (
     FrozenState,
@@ -22,7 +22,6 @@ from cnpgen.schema.catalogue import read_kind
 from cnpgen.schema.keys import RecipeLocation
 from cnpgen.schema.parsing import stored_values
 
-Array = NDArray[np.float64]
 DISTANCE_SCALE_M = 0.1  # size of a residual of 1
 # Tolerances; with fewer the merit function rejects steps for equalities that are met
 # well enough.

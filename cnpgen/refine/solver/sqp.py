@@ -35,8 +35,8 @@ import time
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from cnpgen.arrays import Array
 from cnpgen.refine.solver.bounds import Bounds
 from cnpgen.refine.solver.compiled_backend import CompiledBackend, CompiledSubproblem
 from cnpgen.refine.solver.qp_subproblem import (
@@ -49,7 +49,6 @@ from cnpgen.refine.solver.qp_subproblem import (
 )
 from cnpgen.refine.solver.transcription import Transcription
 
-Array = NDArray[np.float64]
 # Trust radius of the logarithms of the rate, relative to that of the path.
 RATE_RADIUS_FACTOR = 1.5
 MAX_RADIUS, MIN_RADIUS = 1.0, 1e-5  # of the trust region

@@ -7,10 +7,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from cnpgen.arrays import Array
 from cnpgen.errors import UsageError
 from cnpgen.robots.observation.primitives import KINDS, Primitives
 from cnpgen.robots.observation.surface_points import unit_offset
-from cnpgen.robots.shape.hull import Array
 from cnpgen.schema.argument_types import check_fields
 from cnpgen.schema.arguments import integer
 from cnpgen.schema.units import suggested_unit

@@ -5,11 +5,12 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
 
+from cnpgen.arrays import AnyArray
 from cnpgen.errors import UsageError, nearest
 from cnpgen.robots.observation.camera import Camera, depth_image, depth_points
 from cnpgen.robots.observation.primitives import (
@@ -24,7 +25,6 @@ from cnpgen.schema.argument_types import check_fields
 from cnpgen.schema.arguments import integer
 
 Values = NDArray[np.float32]
-Array = NDArray[Any]
 Corner = tuple[float, float, float]
 
 MAX_OBSERVED_POINTS = 10_000_000  # of one observation of one scene
@@ -39,7 +39,7 @@ class ObservationBackend:
     Compiled code overrides each of them.
     """
 
-    def distances(self, scenes: Primitives, points: Array) -> Values:
+    def distances(self, scenes: Primitives, points: AnyArray) -> Values:
         """Return the smallest signed distance of points from the bodies of each scene [m], shape (N, P).
 
         Points in the world frame [m] have shape (P, 3) for all scenes or (N, P, 3).
@@ -82,7 +82,7 @@ class ObservationBackend:
         return _stacked(parts, (count, 3))
 
 
-def _stacked(parts: list[Array], shape: tuple[int, ...]) -> Values:
+def _stacked(parts: list[AnyArray], shape: tuple[int, ...]) -> Values:
     return np.array(parts, np.float32).reshape(len(parts), *shape)
 
 
@@ -94,7 +94,7 @@ class Observation(ABC):
     @abstractmethod
     def observe(
         self, bodies: Primitives, seeds: Seeds, backend: ObservationBackend
-    ) -> dict[str, Array]:
+    ) -> dict[str, AnyArray]:
         """Observe N scenes from their bodies and seeds, shape (N,): name -> array with a first axis of length N."""
 
 
@@ -115,7 +115,7 @@ class SurfaceCloud(Observation):
 
     def observe(
         self, bodies: Primitives, seeds: Seeds, backend: ObservationBackend
-    ) -> dict[str, Array]:
+    ) -> dict[str, AnyArray]:
         """See ``Observation``."""
         return {"cloud": backend.surface_points(bodies, self.points, seeds)}
 
@@ -139,7 +139,7 @@ class CameraCloud(Observation):
 
     def observe(
         self, bodies: Primitives, seeds: Seeds, backend: ObservationBackend
-    ) -> dict[str, Array]:
+    ) -> dict[str, AnyArray]:
         """See ``Observation``."""
         depth = backend.depth_images(bodies, self.camera)
         return {
@@ -179,7 +179,7 @@ class DistanceGrid(Observation):
         bodies: Primitives,
         seeds: Seeds,  # noqa: ARG002
         backend: ObservationBackend,
-    ) -> dict[str, Array]:
+    ) -> dict[str, AnyArray]:
         """See ``Observation``."""
         axes = [
             np.linspace(*ends)
@@ -210,7 +210,7 @@ class BasisPoints(Observation):
         _check_corners(self.low, self.high)
 
     @property
-    def positions(self) -> Array:
+    def positions(self) -> AnyArray:
         """The points, a Kronecker sequence [m], shape (points, 3)."""
         # Of x^4 = x + 1.
         root = 1.2207440846057596
@@ -224,7 +224,7 @@ class BasisPoints(Observation):
         bodies: Primitives,
         seeds: Seeds,  # noqa: ARG002
         backend: ObservationBackend,
-    ) -> dict[str, Array]:
+    ) -> dict[str, AnyArray]:
         """See ``Observation``."""
         return {"basis": backend.distances(bodies, self.positions)}
 
@@ -254,7 +254,7 @@ class ObjectTokens(Observation):
         bodies: Primitives,
         seeds: Seeds,  # noqa: ARG002
         backend: ObservationBackend,  # noqa: ARG002
-    ) -> dict[str, Array]:
+    ) -> dict[str, AnyArray]:
         """See ``Observation``."""
         real = bodies.kinds >= 0
         order = np.argsort(~real, axis=1, kind="stable")  # bodies first
@@ -268,7 +268,7 @@ class ObjectTokens(Observation):
         axes = bodies.rotations[..., :2].swapaxes(2, 3).reshape(*real.shape, 6)
         shapes = np.where(bodies.kinds >= MESH, KINDS.index("box"), bodies.kinds)
         kinds = shapes[..., None] == np.arange(len(KINDS))
-        rows: Array = np.concatenate(
+        rows: AnyArray = np.concatenate(
             [kinds, bodies.centers, axes, bodies.sizes], axis=2
         ).astype(np.float32)
         rows[~real] = 0

@@ -11,11 +11,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from cnpgen.arrays import Array
 from cnpgen.errors import UsageError
 from cnpgen.robots.obstacle import Obstacle
 from cnpgen.robots.scene import PARKED_POSITION_M, Scene
 from cnpgen.robots.shape.convex_part import PRISM_SIDES
-from cnpgen.robots.shape.hull import Array, frames_along
+from cnpgen.robots.shape.hull import frames_along
 from cnpgen.robots.shape.inline import corners_of, is_inline
 from cnpgen.robots.solid import (
     UNBOUNDED_OBSTACLE_HEIGHT_M,

@@ -5,8 +5,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from cnpgen.arrays import Array
 from cnpgen.robots.observation.primitives import KINDS, Primitives
-from cnpgen.robots.shape.hull import Array
 
 Seeds = NDArray[np.uint64]
 

@@ -11,8 +11,9 @@ from operator import attrgetter
 
 import numpy as np
 
+from cnpgen.arrays import Array
 from cnpgen.robots.shape.convex_part import ConvexPart
-from cnpgen.robots.shape.hull import Array, half_sphere, hull_corners
+from cnpgen.robots.shape.hull import half_sphere, hull_corners
 
 SEARCH_DIRECTIONS = 3  # initial directions of the search
 # Corners and facets with the largest violations that are added per round.

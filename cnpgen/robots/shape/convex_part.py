@@ -8,8 +8,9 @@ from xml.etree import ElementTree
 import numpy as np
 from numpy.typing import NDArray
 
+from cnpgen.arrays import Array
 from cnpgen.errors import RecipeError
-from cnpgen.robots.shape.hull import CUBE, MAX_COORDINATE_M, Array, check_solid
+from cnpgen.robots.shape.hull import CUBE, MAX_COORDINATE_M, check_solid
 from cnpgen.robots.shape.inline import corners_of, is_inline
 from cnpgen.robots.urdf import urdf_tree
 

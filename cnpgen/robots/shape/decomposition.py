@@ -17,7 +17,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from cnpgen.robots.shape.hull import Array, hull_corners
+from cnpgen.arrays import Array
+from cnpgen.robots.shape.hull import hull_corners
 from cnpgen.store.files.archives import read_arrays
 from cnpgen.store.files.cache_entry import MAX_ENTRY_BYTES, read_entry, write_entry
 

@@ -8,12 +8,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from cnpgen.arrays import Array
 from cnpgen.errors import UsageError
 
 if TYPE_CHECKING:
     import coal
-
-Array = NDArray[np.float64]
 
 # Corners of the unit cube centered at the origin.
 CUBE = np.array(list(product((-0.5, 0.5), repeat=3)))

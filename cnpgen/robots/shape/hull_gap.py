@@ -14,10 +14,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from cnpgen.arrays import Array
 from cnpgen.errors import RecipeError
 from cnpgen.robots.chain import frame_of
 from cnpgen.robots.shape.convex_part import ConvexPart, convex_part_of, origin_of
-from cnpgen.robots.shape.hull import Array, ball_round, coal_vectors, frame_along
+from cnpgen.robots.shape.hull import ball_round, coal_vectors, frame_along
 from cnpgen.robots.shape.inline import is_inline, read_mesh, scale_of, sides_of
 from cnpgen.robots.shape.link_pairs import (
     ALWAYS_FRACTION,

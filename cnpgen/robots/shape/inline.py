@@ -16,13 +16,13 @@ from xml.etree import ElementTree
 import numpy as np
 from numpy.typing import NDArray
 
+from cnpgen.arrays import Array
 from cnpgen.errors import RecipeError, nearest
 from cnpgen.robots.shape.decomposition import convex_parts
 from cnpgen.robots.shape.hull import (
     MAX_COORDINATE_M,
     MAX_CORNERS,
     MIN_THICKNESS_M,
-    Array,
     enclosing_hull,
     hull_corners,
 )

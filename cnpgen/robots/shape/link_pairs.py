@@ -8,9 +8,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from cnpgen.arrays import Array
 from cnpgen.robots.shape.capsule import Capsule
 from cnpgen.robots.shape.convex_part import ConvexPart
-from cnpgen.robots.shape.hull import Array, ball_round, coal_hull
+from cnpgen.robots.shape.hull import ball_round, coal_hull
 
 if TYPE_CHECKING:
     import pinocchio as pin

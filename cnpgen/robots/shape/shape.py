@@ -12,12 +12,13 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from cnpgen.arrays import Array
 from cnpgen.errors import RecipeError, nearest
 from cnpgen.robots.chain import Chain, frame_of
 from cnpgen.robots.robot_spec import HeldObject
 from cnpgen.robots.shape.capsule import Capsule, covering_capsule, covers
 from cnpgen.robots.shape.convex_part import ConvexPart, link_convex_parts
-from cnpgen.robots.shape.hull import CUBE, Array
+from cnpgen.robots.shape.hull import CUBE
 from cnpgen.robots.shape.link_pairs import (
     ALWAYS_FRACTION,
     LinkContact,

@@ -13,7 +13,6 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from cnpgen.addons.benchmark.benchmark_planner import BenchmarkPlanner, Plan, Setting
 from cnpgen.addons.benchmark.simulator.hockey import (
@@ -24,14 +23,13 @@ from cnpgen.addons.benchmark.simulator.hockey import (
 )
 from cnpgen.addons.benchmark.simulator.tip import Tip
 from cnpgen.addons.trajectories.sampled_trajectory import Trajectory
+from cnpgen.arrays import Array
 from cnpgen.errors import UsageError
 from cnpgen.plans.plans import Plans
 from cnpgen.problems.constraints.table import Table
 from cnpgen.problems.problem_record import open_problem
 from cnpgen.robots.robot import Robot
 from cnpgen.schema.keys import field
-
-Array = NDArray[np.float64]
 
 SAMPLE_PERIOD_S = 0.01  # reduced so that a sample is the hit
 JOINT_WEIGHTS = (1.0, 1.0, 5.0, 1.0, 10.0, 10.0, 0.01)

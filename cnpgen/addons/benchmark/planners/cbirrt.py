@@ -11,7 +11,6 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from cnpgen.addons.benchmark.benchmark_planner import (
     Answer,
@@ -29,6 +28,7 @@ from cnpgen.addons.benchmark.planners.obstacle_boxes import (
 )
 from cnpgen.addons.benchmark.simulator.tip import Tip
 from cnpgen.addons.trajectories.sampled_trajectory import Trajectory
+from cnpgen.arrays import Array
 from cnpgen.errors import requires_extra
 from cnpgen.plans.plans import Plans
 from cnpgen.problems.constraints.table import Table
@@ -37,8 +37,6 @@ from cnpgen.problems.problem_record import open_problem
 from cnpgen.robots.robot import Robot
 from cnpgen.robots.shape.hull import CUBE
 from cnpgen.schema.keys import field
-
-Array = NDArray[np.float64]
 
 MANIFOLD_TOLERANCE = 0.01
 MAX_PROJECTIONS, LAMBDA = 50, 2.0  # defaults of OMPL

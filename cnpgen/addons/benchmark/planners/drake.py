@@ -12,7 +12,6 @@ from typing import Any
 from xml.etree import ElementTree
 
 import numpy as np
-from numpy.typing import NDArray
 
 from cnpgen.addons.benchmark.benchmark_planner import (
     BenchmarkPlanner,
@@ -22,6 +21,7 @@ from cnpgen.addons.benchmark.benchmark_planner import (
 )
 from cnpgen.addons.benchmark.planners.obstacle_boxes import require_table_or_transport
 from cnpgen.addons.trajectories.sampled_trajectory import Trajectory
+from cnpgen.arrays import Array
 from cnpgen.errors import UsageError, requires_extra
 from cnpgen.plans.plans import Plans
 from cnpgen.problems.constraints.joint import JointJerk, JointTorque
@@ -32,8 +32,6 @@ from cnpgen.robots.robot import Robot
 from cnpgen.robots.scene import Scene
 from cnpgen.schema.keys import field
 from cnpgen.trajectory.boundary import Boundary
-
-Array = NDArray[np.float64]
 
 SPLINE_ORDER = 4  # cubic, the default of Drake
 MIN_KNOT_DISTANCE_S = 1e-9  # closer knots are one

@@ -23,13 +23,12 @@ from cnpgen.addons.benchmark.benchmark_planner import (
 from cnpgen.addons.benchmark.planners.sst import Tree, radii_of
 from cnpgen.addons.benchmark.planners.state_check import StateCheck
 from cnpgen.addons.paper.proposals import Proposals, load_proposals, shipped_proposals
+from cnpgen.arrays import Array
 from cnpgen.errors import UsageError
 from cnpgen.plans.plans import Plans
 from cnpgen.problems.problem import Problem
 from cnpgen.problems.problem_record import open_problem
 from cnpgen.schema.keys import field
-
-Array = NDArray[np.float64]
 
 MAX_PROPOSALS = 300_000
 MAX_CONSECUTIVE_STEPS = 100  # before it continues from another node

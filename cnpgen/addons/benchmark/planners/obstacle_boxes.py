@@ -1,14 +1,13 @@
 """Distances and penetration depths of points and boxes, with gradients."""
 
 import numpy as np
-from numpy.typing import NDArray
 
+from cnpgen.arrays import Array
 from cnpgen.errors import UsageError
 from cnpgen.problems.constraints.table import Table
 from cnpgen.problems.problem import Problem
 from cnpgen.robots.scene import Scene
 
-Array = NDArray[np.float64]
 Box = tuple[Array, Array]
 """Lower and upper corner [m], shape (3,) each; obstacles have no lower end."""
 

@@ -12,7 +12,6 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from cnpgen.addons.benchmark.benchmark_planner import (
     Answer,
@@ -29,6 +28,7 @@ from cnpgen.addons.benchmark.planners.cbirrt import (
     seed_ompl,
 )
 from cnpgen.addons.trajectories.sampled_trajectory import Trajectory
+from cnpgen.arrays import Array
 from cnpgen.errors import requires_extra
 from cnpgen.pipelines.resting_states import RestingStates
 from cnpgen.plans.plans import Plans
@@ -37,8 +37,6 @@ from cnpgen.problems.problem import Problem
 from cnpgen.problems.problem_record import open_problem
 from cnpgen.robots.robot import Robot
 from cnpgen.schema.keys import field
-
-Array = NDArray[np.float64]
 
 OUTPUT_PERIOD_S = 0.005
 MIN_WAYPOINT_DISTANCE_RAD = 1e-4  # closer waypoints are joined

@@ -8,16 +8,14 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from cnpgen.addons.benchmark.benchmark_planner import BenchmarkPlanner, Plan, Setting
 from cnpgen.addons.trajectories.sampled_trajectory import Trajectory
+from cnpgen.arrays import Array
 from cnpgen.errors import requires_extra
 from cnpgen.problems.problem_record import open_problem
 from cnpgen.robots.robot import Robot
 from cnpgen.trajectory.boundary import Boundary
-
-Array = NDArray[np.float64]
 
 MIN_SPAN_S = 1e-6  # shorter spans of constant jerk are joined
 

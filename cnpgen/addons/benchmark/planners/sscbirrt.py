@@ -10,7 +10,6 @@ from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from cnpgen.addons.benchmark.benchmark_planner import BenchmarkPlanner, Plan, Setting
 from cnpgen.addons.benchmark.planners.cbirrt import (
@@ -22,13 +21,12 @@ from cnpgen.addons.benchmark.planners.cbirrt import (
 )
 from cnpgen.addons.benchmark.planners.rrtconnect import path_searches
 from cnpgen.addons.trajectories.sampled_trajectory import Trajectory
+from cnpgen.arrays import Array
 from cnpgen.errors import requires_extra
 from cnpgen.plans.plans import Plans
 from cnpgen.problems.problem_record import open_problem
 from cnpgen.robots.robot import Robot
 from cnpgen.schema.keys import field
-
-Array = NDArray[np.float64]
 
 # Default of the package; states of the path may be ten times further away.
 

@@ -17,7 +17,6 @@ from functools import partial
 from time import perf_counter
 
 import numpy as np
-from numpy.typing import NDArray
 
 from cnpgen.addons.benchmark.benchmark_planner import (
     Answer,
@@ -28,12 +27,11 @@ from cnpgen.addons.benchmark.benchmark_planner import (
 )
 from cnpgen.addons.benchmark.planners.state_check import StateCheck
 from cnpgen.addons.trajectories.sampled_trajectory import Trajectory
+from cnpgen.arrays import Array
 from cnpgen.plans.plans import Plans
 from cnpgen.problems.problem import Problem
 from cnpgen.problems.problem_record import open_problem
 from cnpgen.schema.keys import field
-
-Array = NDArray[np.float64]
 
 CONTROL_STEP_S = 5e-3
 MAX_TREE_ITERATIONS = 300_000

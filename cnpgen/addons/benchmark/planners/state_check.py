@@ -10,6 +10,7 @@ from cnpgen.addons.benchmark.planners.obstacle_boxes import (
     MIN_OBJECT_DISTANCE_M,
     require_table_or_transport,
 )
+from cnpgen.arrays import Array
 from cnpgen.kernels.library import choose_backend, problem_kernels
 from cnpgen.kernels.symbolic.linalg import Scalar, Vec, dot
 from cnpgen.kernels.symbolic.symbolic_state import SymbolicState
@@ -17,8 +18,6 @@ from cnpgen.problems.constraints.table import Table
 from cnpgen.problems.problem import Problem
 from cnpgen.robots.robot import Robot
 from cnpgen.robots.shape.hull import CUBE
-
-Array = NDArray[np.float64]
 
 MAX_UPRIGHT_ERROR = 0.05  # of 1 - R_22
 MAX_TIP_HEIGHT_ERROR_M = 0.01

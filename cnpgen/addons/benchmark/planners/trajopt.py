@@ -13,7 +13,6 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from cnpgen.addons.benchmark.benchmark_planner import (
     Answer,
@@ -31,6 +30,7 @@ from cnpgen.addons.benchmark.planners.obstacle_boxes import (
 )
 from cnpgen.addons.benchmark.simulator.tip import Tip
 from cnpgen.addons.trajectories.sampled_trajectory import Trajectory
+from cnpgen.arrays import Array
 from cnpgen.plans.plans import Plans
 from cnpgen.problems.constraints.table import Table
 from cnpgen.problems.problem import Problem
@@ -40,8 +40,6 @@ from cnpgen.robots.scene import Scene
 from cnpgen.robots.shape.hull import CUBE
 from cnpgen.schema.keys import field
 from cnpgen.trajectory.boundary import Boundary
-
-Array = NDArray[np.float64]
 
 KNOTS = 15
 MIN_DURATION_S = 0.1

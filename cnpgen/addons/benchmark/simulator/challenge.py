@@ -13,20 +13,18 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from cnpgen.addons.benchmark.simulator.executed import TickRecord, puck_is_done
 from cnpgen.addons.benchmark.simulator.plant import Plant, rated_torque
 from cnpgen.addons.benchmark.simulator.reference import Reference
 from cnpgen.addons.benchmark.simulator.simulator_scene import SimulatorScene
 from cnpgen.addons.benchmark.simulator.tip import Tip
+from cnpgen.arrays import Array
 from cnpgen.errors import MachineError, UsageError
 from cnpgen.machine.versions import installed_version
 from cnpgen.problems.constraints.table import Table
 from cnpgen.problems.problem import Problem
 from cnpgen.robots.robot import Robot
-
-Array = NDArray[np.float64]
 
 MODULE = "air_hockey_challenge.environments.position_control_wrapper"
 JOINTS = tuple(f"joint_{number}" for number in range(1, 8))

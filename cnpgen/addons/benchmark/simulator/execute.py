@@ -8,7 +8,6 @@ from functools import lru_cache
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from cnpgen.addons.benchmark.simulator.challenge import execute_in_challenge
 from cnpgen.addons.benchmark.simulator.executed import (
@@ -28,11 +27,10 @@ from cnpgen.addons.benchmark.simulator.simulator_scene import (
     SimulatorScene,
     scene_xml,
 )
+from cnpgen.arrays import Array
 from cnpgen.errors import RecipeError, requires_extra
 from cnpgen.problems.problem import Problem
 from cnpgen.robots.robot import Robot
-
-Array = NDArray[np.float64]
 
 OBSERVATION_TIME_S = 0.2  # after a motion without a puck
 # Natural frequency of the closed loop; an error decays within about 1/80 s.

@@ -8,9 +8,8 @@ which is the shape for MuJoCo.
 from math import atan2, exp, pi, sqrt
 
 import numpy as np
-from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from cnpgen.arrays import Array
 
 HOME_M, LENGTH_M, WIDTH_M = 0.53, 1.948, 1.038  # home edge along x; playing field
 GOAL_LINE_M = HOME_M + LENGTH_M

@@ -9,13 +9,11 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from cnpgen.arrays import Array
 from cnpgen.errors import UsageError, nearest
 from cnpgen.problems.problem import Problem
 from cnpgen.robots.robot import Robot
-
-Array = NDArray[np.float64]
 
 
 class Friction(NamedTuple):

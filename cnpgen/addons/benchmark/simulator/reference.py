@@ -6,10 +6,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from cnpgen.arrays import Array
 from cnpgen.errors import UsageError
 from cnpgen.trajectory.spline_motion import Motion
 
-Array = NDArray[np.float64]
 StatesAt = Callable[[Array], tuple[Array, Array, Array]]
 """Positions [rad], velocities [rad/s] and accelerations [rad/s^2] at times [s] of shape (K,), shape (K, n) each."""
 

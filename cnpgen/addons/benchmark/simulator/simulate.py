@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from cnpgen.addons.benchmark.simulator.challenge import challenge_plant, check_challenge
 from cnpgen.addons.benchmark.simulator.execute import Execution, execute, load_mujoco
@@ -22,6 +21,7 @@ from cnpgen.addons.benchmark.simulator.reference import (
 )
 from cnpgen.addons.benchmark.simulator.simulator_scene import SimulatorScene
 from cnpgen.addons.benchmark.simulator.tip import Tip
+from cnpgen.arrays import Array
 from cnpgen.errors import UsageError, counted
 from cnpgen.machine.workers import distribute, worker_count
 from cnpgen.plans.plans import Plans
@@ -29,8 +29,6 @@ from cnpgen.plans.tips import correct_tips
 from cnpgen.problems.problem_record import open_problem, with_payload_of
 from cnpgen.robots.table_frame import table_frame, upright_axes
 from cnpgen.schema.argument_types import checked_arguments
-
-Array = NDArray[np.float64]
 
 SIMULATION_FORMAT = "cnpgen-simulation"
 SIMULATION_VERSION = 1

@@ -12,7 +12,6 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import NDArray
 
 from cnpgen.addons.benchmark.simulator import hockey
 from cnpgen.addons.benchmark.simulator.plant import (
@@ -20,6 +19,7 @@ from cnpgen.addons.benchmark.simulator.plant import (
     joint_friction,
     rotor_inertia,
 )
+from cnpgen.arrays import Array
 from cnpgen.problems.constraints.clearance import ObjectContact
 from cnpgen.problems.constraints.table import Table
 from cnpgen.problems.problem import Problem
@@ -27,8 +27,6 @@ from cnpgen.robots.chain import Joint
 from cnpgen.robots.obstacle import Obstacle
 from cnpgen.robots.robot import Robot
 from cnpgen.robots.solid import Box, Solid, solids_of
-
-Array = NDArray[np.float64]
 
 SIMULATION_STEP_S = 2.5e-4  # four per tick of the controller
 LINK_RADIUS_M = 0.07  # of the iiwa's links, about half of the clearance of plans

@@ -1,11 +1,9 @@
 """Position, orientation and Jacobian of the tip, with Pinocchio."""
 
 import numpy as np
-from numpy.typing import NDArray
 
+from cnpgen.arrays import Array
 from cnpgen.robots.robot import Robot
-
-Array = NDArray[np.float64]
 
 
 class Tip:

@@ -6,17 +6,17 @@ from collections.abc import Callable, Mapping
 from typing import Any
 
 import torch
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from cnpgen.addons.frameworks.host_evaluation import evaluate
+from cnpgen.arrays import AnyArray
 from cnpgen.errors import UsageError
 from cnpgen.losses.plan_loss import PlanLoss
 from cnpgen.planner.boundary_layer import BoundaryLayer
 from cnpgen.planner.tasks import Tasks
 from cnpgen.schema.arguments import numbers
 
-Array = NDArray[Any]
-Function = Callable[..., tuple[Array, ...]]
+Function = Callable[..., tuple[AnyArray, ...]]
 
 
 def control_points(
@@ -44,13 +44,13 @@ def control_points(
     outputs = (real_tensor("phi", phi), real_tensor("log_rate", log_rate))
     layer.check_shapes(tasks, *(tuple(output.shape) for output in outputs))
 
-    def function(phi: Array, log_rate: Array) -> tuple[Array, Array]:
+    def function(phi: AnyArray, log_rate: AnyArray) -> tuple[AnyArray, AnyArray]:
         points = layer(tasks, phi, log_rate)
         return points.path, points.rate
 
     def vjp(
-        phi: Array, log_rate: Array, by_path: Array, by_rate: Array
-    ) -> tuple[Array, Array]:
+        phi: AnyArray, log_rate: AnyArray, by_path: AnyArray, by_rate: AnyArray
+    ) -> tuple[AnyArray, AnyArray]:
         return layer.vjp(
             tasks, phi, log_rate, path_gradient=by_path, rate_gradient=by_rate
         )
