@@ -4,6 +4,7 @@ from cnpgen.pipelines.pipeline import Pipeline as Pipeline
 from cnpgen.pipelines.pipeline import load_pipeline as load_pipeline
 from cnpgen.problems.problem import Objective as Objective
 from cnpgen.problems.problem_record import ProblemRecord as ProblemRecord
+from cnpgen.robots.drive import DriveLine as DriveLine
 from cnpgen.robots.drive import DriveSpec as DriveSpec
 from cnpgen.robots.obstacle import Obstacle as Obstacle
 from cnpgen.robots.parameter_ranges import ParameterRanges as ParameterRanges

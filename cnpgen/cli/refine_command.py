@@ -201,8 +201,8 @@ def check_free(out: Path, *, force: bool, unless_finished: bool = False) -> None
     """
     from cnpgen.cli.finished import request_file
 
-    is_result = unless_finished and request_file(out).exists()
-    if out.exists() and not force and not is_result:
+    is_result = unless_finished and out.suffix == ".h5" and request_file(out).exists()
+    if out.is_file() and not force and not is_result:
         raise UsageError(f"{out} exists: --force replaces it, -o names another file")
     check_place(out)
 

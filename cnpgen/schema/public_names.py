@@ -12,8 +12,6 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any
 
-from cnpgen.schema.foreign_paths import import_errors_with_hint
-
 NAMES = "cnpgen.names"
 
 
@@ -31,6 +29,8 @@ def lazy_exports(
         if name == "__all__":
             return names()
         if name in modules:
+            from cnpgen.schema.foreign_paths import import_errors_with_hint
+
             with import_errors_with_hint():
                 value = getattr(import_module(modules[name]), name)
         elif name.startswith("_"):

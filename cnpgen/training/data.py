@@ -235,6 +235,7 @@ def open_training_data(
         raise UsageError(
             f"{folder} holds scenes: {{robot}} trains on them",
             remedies={"robot": "panda"},
+            concerns="folder",
         )
     dataset = load_dataset(folder)
     names = [name for name, rows in dataset.splits.items() if rows]

@@ -384,7 +384,7 @@ def _of_planners(folder: Path, model: Any, dataset: Any, plans: Any) -> list[Val
                 "state": state,
                 "puck": [1.0, 0.1],
                 "target": [2.4, 0.0],
-                "speed_share": 0.5,
+                "options": results.HitOptions(speed_share=0.5),
             },
         ),
         ValidCall(
@@ -399,7 +399,7 @@ def _of_planners(folder: Path, model: Any, dataset: Any, plans: Any) -> list[Val
             | {
                 "puck_velocity": np.array([-0.3, 0.1]),
                 "meeting_time": 0.9,
-                "puck_model": results.PuckModel(),
+                "options": results.HitOptions(puck_model=results.PuckModel()),
                 "home": base,
             },
         ),
@@ -647,6 +647,7 @@ def _of_scenes(folder: Path) -> list[ValidCall]:
             {"frame": "", "position": start[:3], "rotation": np.eye(3)},
         ),
         ValidCall("Grasp", scenes.Grasp, _fields(grasp)),
+        ValidCall("SceneOptions", scenes.SceneOptions, {"payload": 1.0}),
         ValidCall("Layout", scenes.Layout, {"obstacles": (post,), "grasps": (grasp,)}),
         ValidCall("SceneProblem", scenes.SceneProblem, _fields(scene)),
     ]
@@ -658,6 +659,9 @@ def _of_sampled(folder: Path, problem: Any, plans: Any) -> list[ValidCall]:
     sampled = loaded.trajectories[0]
     fitted = plans.motion[[0]]
     return [
+        ValidCall(
+            "LoadOptions", trajectories.LoadOptions, {"unit": "deg", "rate": 100.0}
+        ),
         ValidCall(
             "load_trajectories",
             trajectories.load_trajectories,

@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 
 from cnpgen.errors import MachineError
-from cnpgen.kernels.collision.clearance_loss import SOURCES as LOSS_SOURCES
 from cnpgen.kernels.collision.clearance_loss import ClearanceLoss
 from cnpgen.kernels.collision.collision_checker import (
     SOURCES,
@@ -55,9 +54,9 @@ def failing(tmp_path_factory) -> Path:
     return path
 
 
-def library_of(failing, sources=SOURCES):
+def library_of(failing):
     kernels = KernelLibrary(*choose_backend("compiled"), "", {})
-    return load_collision_library(kernels, [failing, *sources])
+    return load_collision_library(kernels, [failing, *SOURCES])
 
 
 def failures(library, call) -> int:
@@ -121,7 +120,7 @@ def test_a_tree_that_grows_without_memory(failing, setting):  # noqa: F811
 
 def test_losses_without_memory(failing, setting):  # noqa: F811
     robot = setting[1]
-    library = library_of(failing, LOSS_SOURCES)
+    library = library_of(failing)
     loss, q = ClearanceLoss(library, robot), np.array(BESIDE_WALL)[:, :, None]
     assert failures(library, lambda: loss(q, scene_primitives([SCENE]), 0.05)) == 6 + 2
 

@@ -377,7 +377,11 @@ def test_ctrl_c_during_explanations_keeps_finished_plans(
     assert begun.endswith("1 plan, 1 exist already")
     assert explaining == "explaining: 1 plan"
     assert "infeasible" in " ".join(summary)
-    assert [path.name for path in sorted(tmp_path.iterdir())] == ["hard.h5", "out.h5"]
+    assert [path.name for path in sorted(tmp_path.iterdir())] == [
+        ".out.h5.request",
+        "hard.h5",
+        "out.h5",
+    ]
 
 
 def test_solve_and_refine_write_files_that_are_valid_by_evaluate(
@@ -406,7 +410,7 @@ def test_solve_and_refine_write_files_that_are_valid_by_evaluate(
         summary["checksum"],
     ) == (3, 3, [], "right")
     assert main(["evaluate", summary["file"]]) == 0
-    assert sorted(path.name for path in tmp_path.iterdir()) == [
+    assert sorted(path.name for path in tmp_path.glob("[!.]*")) == [
         "plans-refined.h5",
         "plans.h5",
     ]

@@ -146,7 +146,7 @@ def test_notices_are_printed_once_each_and_not_in_quiet_mode(capsys):
         for text in ("first", "second", "first"):
             logger.info(text)
     assert capsys.readouterr() == ("", "cnpgen: first\ncnpgen: second\n")
-    with notices(quiet=True):
+    with notices("WARNING"):
         logger.info("first")
     logger.info("first")
     assert capsys.readouterr() == ("", "")

@@ -38,7 +38,7 @@ def test_this_machine_has_no_problems():
     assert 1 <= report.cores <= report.cores_present
     assert report.hdf5[0].isdigit()
     assert report.free_bytes > 0
-    assert "11 datasets" in report.recipes
+    assert "13 datasets" in report.recipes
 
 
 def test_every_dependency_is_checked():

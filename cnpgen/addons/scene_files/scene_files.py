@@ -80,6 +80,10 @@ def load_scenes(
     """
     path, start = Path(path), integer("start", start, least=0)
     stop = None if n is None else start + integer("n", n, least=1)
+    if not all(isinstance(each, str | Path) for each in packages):
+        raise UsageError(
+            f"must be paths of folders, got {packages}", argument="packages"
+        )
     options = ReadingOptions(
         tuple(allow_unused), tuple(map(Path, packages)), present or {}
     )

@@ -87,12 +87,14 @@ class _RobotScene(ctypes.Structure):
     )
 
 
-def load_collision_library(kernels: KernelLibrary) -> ctypes.CDLL | None:
+def load_collision_library(
+    kernels: KernelLibrary, sources: Sequence[Path] = SOURCES
+) -> ctypes.CDLL | None:
     """Return the library of collision checks, the same for all robots.
 
     None where kernels are not compiled.
     """
-    library = kernels.load_source(*SOURCES)
+    library = kernels.load_source(*sources)
     if library is not None:
         for function in (
             library.clear_states,

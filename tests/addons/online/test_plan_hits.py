@@ -37,9 +37,7 @@ def state(planner) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 def test_the_speed_is_accepted_as_a_keyword_for_one_version(planner, state):
     new = plan_hits(planner, state, PUCKS, TARGET, options=HitOptions(speed_share=0.5))
     with pytest.warns(DeprecationWarning, match="options=HitOptions") as warned:
-        old = plan_hits(
-            planner, state, PUCKS, TARGET, options=HitOptions(speed_share=0.5)
-        )
+        old = plan_hits(planner, state, PUCKS, TARGET, speed_share=0.5)
     assert warned[0].filename == __file__
     np.testing.assert_array_equal(
         old.plans.path_control_points, new.plans.path_control_points
