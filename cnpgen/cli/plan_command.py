@@ -95,8 +95,8 @@ def run(arguments: argparse.Namespace) -> int:
     import json
     import time
 
-    from cnpgen.cli.finished import is_finished, record_request
-    from cnpgen.planner.model_file import load_model
+    from cnpgen.cli.finished import content_sha256, is_finished, record_request
+    from cnpgen.planner.model_file import find_model, load_model
     from cnpgen.planner.planner import Planner
     from cnpgen.plans import save_plans
 
@@ -104,8 +104,8 @@ def run(arguments: argparse.Namespace) -> int:
     model = load_model(arguments.model)
     requests = _requests(arguments, model)
     request = [
-        model.problem.comparable_sha256,
-        _checksums({"parameters": model.parameters, **requests.boundary.arrays()}),
+        content_sha256(find_model(arguments.model)),
+        _checksums(requests.boundary.arrays()),
         _checksums({**requests.columns, "sample_id": requests.sample_id}),
         options_of(arguments, "no_time_scaling", "allow_large_angles"),
     ]

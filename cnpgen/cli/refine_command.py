@@ -132,6 +132,8 @@ def refine_and_save(
     ``make`` is ``refine_plans`` by default, ``solve_plans``, or a function that solves
     scenes and has no plans; then ``request`` is all that these depend on.
     """
+    import joblib
+
     from cnpgen.cli.finished import is_finished, record_request
     from cnpgen.plans import save_plans
     from cnpgen.refine.options import RefineOptions
@@ -141,8 +143,12 @@ def refine_and_save(
     options = RefineOptions(
         **{name: value for name, value in given.items() if value is not None}
     )
+    if plans is not None:
+        # Columns without effect on the refined motions are kept in the result.
+        kept = joblib.hash([plans.columns, plans.sample_id])
+        request = [identity_of_run(plans, options), kept]
     request = [
-        request if plans is None else identity_of_run(plans, options),
+        request,
         make.__name__ if make is not None and plans is not None else "",
         options.document(),
     ]

@@ -129,10 +129,11 @@ def _solve_scenes(arguments: argparse.Namespace, out: Path) -> int:
             dict(zip(joints, positions, strict=False)),
         ),
     )
+    record = record_problem(problem)
     request = [
         # With the meshes, which other files may hold.
         joblib.hash(scenes),
-        record_problem(problem).comparable_sha256,
+        [record.recipe, record.urdf],
         options_of(arguments, "payload"),
     ]
 

@@ -16,6 +16,7 @@ from cnpgen.errors import MachineError, UsageError
 from cnpgen.problems.constraints.axis import TipAxis
 from cnpgen.problems.constraints.clearance import ObjectContact, RobotClearance
 from cnpgen.problems.constraints.constraint import Constraint
+from cnpgen.problems.constraints.joint import JointTorque
 from cnpgen.problems.constraints.link_clearance import ObjectClearance
 from cnpgen.problems.constraints.table import Table
 from cnpgen.problems.objectives import Centrifugal, ObjectiveTerm
@@ -196,6 +197,14 @@ class Problem:
                     key,
                     f"there are {count:,} of them, expected at most {MAX_TABLES}: kernels grow with each",
                 )
+        limits = [
+            key for key in ("torque", "line", "power") if getattr(self.drive, key)
+        ]
+        if limits and self.first(JointTorque) is None:
+            yield (
+                f"drive.{limits[0]}",
+                "limits motors, and no constraint joint-torque of the problem applies it",
+            )
         if sum(constraint.scene_width > 0 for constraint in self.constraint) > 1:
             yield (
                 "constraint",

@@ -546,3 +546,17 @@ def test_plots_show_torques_of_both_sides() -> None:
             assert robot.drive is not None
             expected = largest / robot.drive.torque_limit[:, None]
             np.testing.assert_allclose(np.abs(shares["motor torque"]), expected)
+
+
+@pytest.mark.parametrize(
+    "limit", ["power = 1", "torque = 5", "[[drive.line]]\ntorque = 5\nspeed = 3"]
+)
+def test_limits_of_motors_need_a_constraint_that_applies_them(
+    tmp_path: Path, limit: str
+) -> None:
+    arm(tmp_path, '[drive]\nurdf_dynamics = "ignore"')
+    file = tmp_path / "problem.toml"
+    text = file.read_text().replace('use = "joint-torque"', 'use = "joint-velocity"')
+    file.write_text(text.replace('"ignore"', f'"ignore"\n{limit}'))
+    with pytest.raises(RecipeError, match="no constraint joint-torque"):
+        load_problem(file)

@@ -5,12 +5,16 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from cnpgen.problems.load_robot import load_robot
+from cnpgen.problems.problem_file import load_problem
 from cnpgen.refine.proof.end_check import EndCheck
 from cnpgen.refine.strategy import RefinementSearch
 from cnpgen.refine.task import Attempt, Outcome
+from cnpgen.robots.scene import Scene
 from cnpgen.trajectory.boundary import Boundary
 from tests.examples.plans import Plan, load
 from tests.examples.refiner import refine
+from tests.examples.shaped_robot import write_problem
 
 LABELS = ("hit", "replan", "transport")
 
@@ -94,3 +98,12 @@ def test_a_held_object_in_collision_at_an_end_is_named_with_end_and_link() -> No
 def limits(label: str) -> tuple[np.ndarray, np.ndarray]:
     robot = load(label).robot
     return robot.position_lower, robot.position_upper
+
+
+def test_a_scene_without_obstacles_has_ends_without_distances(tmp_path) -> None:
+    problem = load_problem(write_problem(tmp_path))
+    robot = load_robot(problem)
+    empty, zero = problem.with_obstacles(()), np.zeros((1, robot.n))
+    boundary = Boundary(robot.home[None], zero, zero, robot.home[None], zero)
+    scene = Scene((), np.empty((1, 0)))
+    assert not list(EndCheck(empty, robot).violations(boundary, scene))

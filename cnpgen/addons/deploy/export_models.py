@@ -57,9 +57,17 @@ def run(arguments: argparse.Namespace) -> int:
         raise UsageError(f"{folder} is a file: a planner is written into a folder")
     check_writable(folder)
     files = planner_files(arguments.file, arguments.rows)
+    if all(_is_there(folder / name, text) for name, text in files.items()):
+        print(folder / next(iter(files)))  # an interrupted job may run again
+        return 0
     recipe_names.check_absent(folder, files, force=arguments.force)
     print(write_planner(files, folder)[0])
     return 0
+
+
+def _is_there(path: Path, text: str) -> bool:
+    """Return whether a file has a text."""
+    return path.is_file() and path.read_bytes() == text.encode()
 
 
 def _is_model(path: Path) -> bool:

@@ -8,11 +8,12 @@ there. An interrupted download continues at the byte where it stopped.
 import time
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import ThreadPoolExecutor, as_completed
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
+from threading import Event
 
 from tqdm import tqdm
 
@@ -52,12 +53,16 @@ class RemoteFolder(ABC):
     url: str
 
     @abstractmethod
-    def save(self, name: str, path: Path, *, max_bytes: int, anew: bool) -> None:
+    def save(
+        self, name: str, path: Path, *, max_bytes: int, anew: bool, stop: Event
+    ) -> None:
         """Save a file, of at most so many bytes, at a path that may have its beginning.
 
-        ``anew`` demands a new download of the whole file.
+        ``anew`` demands a new download of the whole file. A download ends early if
+        ``stop`` is set.
 
         Raises:
+            InterruptedError: It was set.
             FileNotFoundError: There is no such file.
             Exception: Any other error of the library or the system.
         """
@@ -129,19 +134,28 @@ def _download(remote: RemoteFolder, folder: Path) -> None:
 
 
 def _fetch(remote: RemoteFolder, folder: Path, files: Sequence[ListedFile]) -> None:
-    """Download files, several at a time, with a bar on a terminal."""
-    save = partial(_save, remote, folder)
+    """Download files, several at a time, with a bar on a terminal.
+
+    After an error or Ctrl-C the files in transfer end early, and no other one begins.
+    """
+    stop = Event()
+    save = partial(_save, remote, folder, stop)
     with (
         ThreadPoolExecutor(MAX_CONNECTIONS) as pool,
         tqdm(
             total=len(files), desc=remote.url, unit="file", disable=None, delay=1
         ) as bar,
     ):
-        for _ in pool.map(save, files):
-            bar.update()
+        try:
+            for done in as_completed([pool.submit(save, file) for file in files]):
+                done.result()
+                bar.update()
+        finally:
+            stop.set()
+            pool.shutdown(wait=False, cancel_futures=True)
 
 
-def _save(remote: RemoteFolder, folder: Path, file: ListedFile) -> None:
+def _save(remote: RemoteFolder, folder: Path, stop: Event, file: ListedFile) -> None:
     """Download a file unless an earlier call did, and verify it."""
     path = folder / file.name
     if path.is_file():
@@ -153,7 +167,9 @@ def _save(remote: RemoteFolder, folder: Path, file: ListedFile) -> None:
     # A damaged file is downloaded once more.
     for anew in (False, True):
         try:
-            remote.save(file.name, beginning, max_bytes=file.max_bytes, anew=anew)
+            remote.save(
+                file.name, beginning, max_bytes=file.max_bytes, anew=anew, stop=stop
+            )
         except FileNotFoundError as error:
             if file.name in DESCRIPTIONS:
                 # A published folder may lack them.

@@ -6,9 +6,11 @@ AWS_ACCESS_KEY_ID, and of the configuration of fsspec.
 
 import hashlib
 import io
+import re
 from dataclasses import dataclass, replace
 from http import HTTPStatus
 from pathlib import Path
+from threading import Event
 from typing import IO, Any
 
 from cnpgen.addons.hub.downloads import HDF5, RemoteFolder, local_copy
@@ -25,7 +27,7 @@ from cnpgen.store.files.size_limits import MAX_DOCUMENT_BYTES
 from cnpgen.store.layout import MANIFEST
 
 DATASETS = "datasets"  # folder of the copies in the cache
-BLOCK_BYTES = 1 << 20
+BLOCK_BYTES = 1 << 16  # a transfer is ended between two blocks
 _PACKAGES = {"s3": "s3fs", "gs": "gcsfs"}
 
 
@@ -43,20 +45,22 @@ class FileSystemFolder(RemoteFolder):
     system: Any
     path: str
 
-    def save(self, name: str, path: Path, *, max_bytes: int, anew: bool) -> None:
+    def save(
+        self, name: str, path: Path, *, max_bytes: int, anew: bool, stop: Event
+    ) -> None:
         """Append the rest of a file to a path; see ``RemoteFolder.save``."""
         if anew:
             path.unlink(missing_ok=True)
         try:
             with path.open("ab") as target:
-                self.append(name, target, max_bytes)
+                self.append(name, target, max_bytes, stop)
         except ValueError:
             # From servers that cannot begin in the middle of a file.
             path.unlink()
             with path.open("ab") as target:
-                self.append(name, target, max_bytes)
+                self.append(name, target, max_bytes, stop)
 
-    def append(self, name: str, target: IO[bytes], max_bytes: int) -> None:
+    def append(self, name: str, target: IO[bytes], max_bytes: int, stop: Event) -> None:
         """Append what a file has beyond the bytes that are already there."""
         first = target.tell()
         # Over HTTP, one request for a whole file, instead of one for each block.
@@ -67,6 +71,8 @@ class FileSystemFolder(RemoteFolder):
                 source.seek(first)
             left = max_bytes - first
             while left > 0 and (block := source.read(min(BLOCK_BYTES, left))):
+                if stop.is_set():
+                    raise InterruptedError("another file or the caller ended it")
                 target.write(block)
                 left -= len(block)
 
@@ -97,9 +103,10 @@ def download(url: str) -> Path:
         text = f"{url:.200}: expected the URL of a folder, without a query or an anchor"
         raise UsageError(text, concerns="folder")
     remote = _open_folder(url.rstrip("/"))
+    cache_key, url = url, remote.url
     for folder in (remote, replace(remote, path=f"{remote.path}/{HDF5}")):
         if manifest := _read_manifest(folder):
-            return local_copy(folder, manifest, _cache_folder(url, manifest))
+            return local_copy(folder, manifest, _cache_folder(cache_key, manifest))
     raise DatasetError(
         f"{url} has no finished dataset: neither {MANIFEST} nor {HDF5}/{MANIFEST}"
     )
@@ -110,7 +117,9 @@ def _open_folder(url: str) -> FileSystemFolder:
     with requires_extra("hub", "fsspec"):
         import fsspec
     try:
-        return FileSystemFolder(url, *fsspec.url_to_fs(url))
+        # Messages name the address without user and password.
+        shown = re.sub("//[^/@]*@", "//", url)
+        return FileSystemFolder(shown, *fsspec.url_to_fs(url))
     except ImportError as error:
         package = _PACKAGES.get(scheme, "'cnpgen[hub]'")
         text = f"{scheme}:// needs a package that is missing: pip install {package}"
@@ -121,7 +130,7 @@ def _read_manifest(folder: FileSystemFolder) -> bytes:
     """Read the manifest of a folder; empty if it has none."""
     content = io.BytesIO()
     try:
-        folder.append(MANIFEST, content, MAX_DOCUMENT_BYTES)
+        folder.append(MANIFEST, content, MAX_DOCUMENT_BYTES, Event())
     except FileNotFoundError:
         return b""
     except Exception as error:

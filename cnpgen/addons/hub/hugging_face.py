@@ -9,6 +9,7 @@ import re
 import urllib.parse
 from dataclasses import dataclass
 from pathlib import Path
+from threading import Event
 
 from cnpgen.addons.hub.downloads import HDF5, RemoteFolder, local_copy
 from cnpgen.addons.hub.publish import REPOSITORY, link_or_copy
@@ -38,7 +39,15 @@ class HubFolder(RemoteFolder):
     revision: str | None
     folder: str
 
-    def save(self, name: str, path: Path, *, max_bytes: int, anew: bool) -> None:  # noqa: ARG002 - the sha256 is verified
+    def save(
+        self,
+        name: str,
+        path: Path,
+        *,
+        max_bytes: int,  # noqa: ARG002 - the sha256 is verified
+        anew: bool,
+        stop: Event,  # noqa: ARG002 - the library downloads whole files
+    ) -> None:
         """Give a file of the Hub's cache a second name, and download it before; see ``RemoteFolder.save``."""
         source = self.cached(name, anew=anew).resolve()
         path.unlink(missing_ok=True)

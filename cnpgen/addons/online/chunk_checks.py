@@ -65,8 +65,11 @@ class ChunkChecks:
                 f"has {values.shape[1]} columns, earlier ones have {self._columns}",
                 argument="chunk",
             )
-        self._columns = values.shape[1]
         return values[:, :n], values[:, n:]
+
+    def keep_columns(self, columns: int) -> None:
+        """Demand a number of columns of all later chunks."""
+        self._columns = columns
 
     def refuted(self, q: Array) -> str:
         """Return a limit that no motion within the noise of samples, shape (K, n), meets; empty if none is proven."""
@@ -98,7 +101,8 @@ def checked_state(measured: tuple[ArrayLike, ArrayLike], n: int) -> tuple[Array,
 def checked_errors(tracking_error: ArrayLike, n: int) -> Array:
     """Return positive tracking errors, shape (n,)."""
     errors = numbers("tracking_error", tracking_error)
-    if errors.shape not in {(), (n,)} or not (errors > 0).all():
+    fits = errors.shape in {(), (n,)} and np.asarray(tracking_error).dtype != bool
+    if not fits or not (np.isfinite(errors) & (errors > 0)).all():
         raise UsageError(
             f"must be one positive number or {n} of them, got {tracking_error!r:.100}",
             argument="tracking_error",

@@ -37,6 +37,7 @@ NOISE_RAD = 1e-3
 RATES_HZ, TIMES_S = (0.1, 1000.0), (1e-3, 60.0)  # ranges of options
 MAX_CHUNK_SAMPLES, MAX_SPEED = 1000, 10.0
 STOP_DELAY_S = 0.05  # of a stop after its cause: it is computed meanwhile
+MAX_POSITION = 1e6  # rad or m, of a chunk
 GRID_STEP_S = 4e-3  # of sampled motions, whose knots are 0.1 s apart
 MAX_MEASURED_SPEED = 1.1  # fraction of the velocity limits
 MAX_RESTING_SPEED = 0.05  # fraction of the velocity limits, of an arm that is at rest
@@ -109,6 +110,8 @@ class ChunkExecutor:
         self._stale_after = bounded("stale_after", stale_after, *TIMES_S)
         self._tracking_error = checked_errors(tracking_error, self._robot.n)
         max_speed = bounded("speed", speed, 1.0, MAX_SPEED)
+        if stop_after is not None:
+            stop_after = bounded("stop_after", stop_after, *TIMES_S)
         self._horizon = horizon(stop_after, self._length, self._rate)
         self._checks = ChunkChecks(
             opened,
@@ -118,11 +121,12 @@ class ChunkExecutor:
             noise=positive("noise", noise),
         )
         self._motions = ChunkMotions(self._record, self._rate, max_speed)
-        # The matrices of all lengths that delays leave.
+        # Numbers of samples that delays leave, one of each parametrization of motions.
         delay = (self._stale_after + self._join) * max_speed
         skipped = min(int(delay * self._rate) + 1, self._length - MIN_CHUNK_SAMPLES)
-        for left in range(self._length - skipped, self._length + 1):
-            self._motions.prepare(min(left, self._horizon))
+        left = range(self._length - skipped, self._length + 1)
+        used = [min(samples, self._horizon) for samples in left]
+        self._lengths = self._motions.prepare(used)
         self._lock = threading.RLock()
         self._runtime: PlanRuntime | None = None
         self._latched: SwitchOutcome | None = SwitchOutcome.STOPPED
@@ -152,6 +156,16 @@ class ChunkExecutor:
         with concerning("measured"):
             check_units_of_states(
                 self._robot, {"start_q": q[None], "start_dq": dq[None]}, noun="state"
+            )
+        outside = np.maximum(
+            self._robot.position_lower - q, q - self._robot.position_upper
+        )
+        if (outside > self._tracking_error).any():
+            joint = int(np.argmax(outside))
+            raise UsageError(
+                f"{self._record.joint_names[joint]} is {outside[joint]:.3g} rad outside"
+                " its position limits",
+                concerns="measured",
             )
         resting = np.abs(dq) <= MAX_RESTING_SPEED * self._robot.velocity_limit
         if not resting.all():
@@ -227,6 +241,8 @@ class ChunkExecutor:
         Raises:
             UsageError: A shape is wrong, or the executor was never reset.
         """
+        # A stop during this call refuses the chunk, also after the next reset.
+        stops = None if self._runtime is None else self._runtime.stops
         q, others = self._checks.read(chunk)
         state = checked_state(measured, self._robot.n)
         now = number("time", time)
@@ -239,14 +255,30 @@ class ChunkExecutor:
                 self._latch(cause)
         if self._latched is not None:
             return self._refusal(self._latched, inner)
-        return self._join_chunk(runtime, inner, q, others, inner - now + observed)
+        times = inner, inner - now + observed
+        return self._join_chunk(runtime, q, others, times=times, stops=stops)
 
     def _join_chunk(
-        self, runtime: PlanRuntime, now: float, q: Array, others: Array, observed: float
+        self,
+        runtime: PlanRuntime,
+        q: Array,
+        others: Array,
+        *,
+        times: tuple[float, float],
+        stops: int | None,
     ) -> ChunkJoin:
-        """Check a chunk, fit a motion to it and switch to it; times are those of the runtime."""
+        """Check a chunk, fit a motion to it and switch to it.
+
+        ``times`` are those of the call and of the observation on the clock of the
+        runtime, and ``stops`` the number of its stops before the call.
+        """
+        now, observed = times
         if not (np.isfinite(q).all() and np.isfinite(others).all()):
             return self._refusal(SwitchOutcome.NOT_FINITE, now)
+        self._checks.keep_columns(q.shape[1] + others.shape[1])
+        if (np.abs(q) > MAX_POSITION).any():
+            detail = f"a position above {MAX_POSITION:g}"
+            return self._refusal(SwitchOutcome.OUTLIER, now, detail)
         if detail := self._checks.refuted(q):
             return self._refusal(SwitchOutcome.OUTLIER, now, detail)
         at, skipped = self._progress.next_sample(observed, now + self._join, self._rate)
@@ -258,19 +290,23 @@ class ChunkExecutor:
         distance = motion.distance
         join = ChunkJoin(SwitchOutcome.FAR, at, distance=distance, skipped=skipped)
         if distance <= self._max_distance:
-            return self._switch(runtime, motion, join)
+            return self._switch(runtime, motion, join, stops)
         text = f"{distance:.3g} rad, expected at most {self._max_distance:g}"
         return self._in_callers_time(replace(join, detail=text))
 
     def _switch(
-        self, runtime: PlanRuntime, motion: ChunkMotion, join: ChunkJoin
+        self,
+        runtime: PlanRuntime,
+        motion: ChunkMotion,
+        join: ChunkJoin,
+        stops: int | None,
     ) -> ChunkJoin:
         """Switch to the fastest speed that is valid, or to the chunk's own timing."""
         for index in dict.fromkeys((self._motions.fastest(motion), 0)):
             plan, speed = motion.at_speed(index)
             executed = self._progress.executed(motion, plan, join.time)
             self._progress.add(executed)
-            switch = runtime.switch(plan, join.time)
+            switch = runtime.switch(plan, join.time, stops=stops)
             if not switch.accepted:
                 self._progress.remove(executed)
             join = replace(
@@ -281,7 +317,11 @@ class ChunkExecutor:
         return self._in_callers_time(join)
 
     def _start(self, q: Array) -> PlanRuntime:
-        """Start a runtime at rest; a motion that stands still loads the judge before the first chunk."""
+        """Start a runtime at rest.
+
+        Motions that stand still, one of each parametrization, make the matrices of the
+        verdict before the first chunk: later they would make a step eight times as long.
+        """
         runtime = PlanRuntime(
             self._record,
             q,
@@ -291,9 +331,10 @@ class ChunkExecutor:
             grid_step=GRID_STEP_S,
         )
         self._progress = ChunkProgress(runtime)
-        samples = np.tile(q, (self._horizon, 1))
-        still = self._motions.motion(samples, samples[:, :0], runtime.state_at(0.0))
-        runtime.switch(still.at_speed(self._motions.fastest(still))[0], 0.0)
+        for length in self._lengths:
+            samples = np.tile(q, (length, 1))
+            still = self._motions.motion(samples, samples[:, :0], runtime.state_at(0.0))
+            runtime.switch(still.at_speed(self._motions.fastest(still))[0], 0.0)
         return runtime
 
     def _read_clock(

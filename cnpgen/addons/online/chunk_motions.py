@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from math import ceil
 
@@ -67,9 +68,12 @@ class ChunkMotions:
         for part in [] if robot.shape is None else robot.shape.convex_parts:
             _ = convex_body(part.vertices, part.radius).shape  # built before verdicts
 
-    def prepare(self, length: int) -> None:
-        """Compute the matrices of chunks of a length."""
-        self._grid(chunk_fit(length, self._rate).spec)
+    def prepare(self, lengths: Iterable[int]) -> list[int]:
+        """Compute the matrices of chunks of all lengths; return one length of each parametrization of motions."""
+        specs = {chunk_fit(length, self._rate).spec: length for length in lengths}
+        for spec in specs:
+            self._grid(spec)
+        return list(specs.values())
 
     def motion(self, q: Array, others: Array, state: SetPoint) -> ChunkMotion:
         """Fit a motion from a state to samples, shape (K, n), after clipping them to the position limits."""

@@ -16,6 +16,7 @@ from cnpgen.addons.online.motion_check import MotionChecker
 from cnpgen.addons.online.plan_admission import Admission, Executable, plan_of_request
 from cnpgen.addons.online.replan_requests import ReplanRequests
 from cnpgen.addons.online.set_points import (
+    GRID_STEPS_S,
     MAX_GRID_STEP_S,
     SampledMotion,
     SetPoint,
@@ -75,7 +76,7 @@ class PlanRuntime:
         keep_stops: Whether stops are computed in the background before they are needed,
             which may take all of a processor core after a switch.
         grid_step: Largest step of the grid on which motions are sampled [s]. Steps of
-            1 ms suit time-optimal motions; slower ones may have longer steps.
+            1 ms suit time-optimal motions; slower ones may have steps of at most 4 ms.
 
     Raises:
         UsageError: The positions have another shape or are not finite, or a parameter
@@ -107,7 +108,7 @@ class PlanRuntime:
             parameters,
             judge=judge,
             checker=self._checker,
-            grid_step=positive("grid_step", grid_step),
+            grid_step=_checked_grid_step(grid_step),
         )
         self._timeline = Timeline(
             at_rest(_checked_positions("q", q, robot.n), number("time", time)),
@@ -159,6 +160,11 @@ class PlanRuntime:
         return self._timeline.now
 
     @property
+    def stops(self) -> int:
+        """Number of stops and resumptions so far; see ``switch``."""
+        return self._stops
+
+    @property
     def stopped(self) -> bool:
         """Whether a stop was accepted and the runtime has not been resumed."""
         return self._stop is not None
@@ -206,7 +212,9 @@ class PlanRuntime:
         return part.plan, float(np.interp(found, part.edges, part.plan_times))
 
     @checked_arguments
-    def switch(self, plan: Executable | None, at: float) -> Switch:
+    def switch(
+        self, plan: Executable | None, at: float, *, stops: int | None = None
+    ) -> Switch:
         """Switch to a plan at a time, if it is valid, ends at rest and arrives in time.
 
         A motion that was accepted for a later time is replaced, and ``Switch.detail``
@@ -216,11 +224,14 @@ class PlanRuntime:
             plan: One plan, one sequence, or one hit of ``plan_hits``, from
                 ``state_at(at)`` to rest; None is refused.
             at: Switch time [s], not before the last time of ``set_point``.
+            stops: ``stops`` when the plan was requested: a stop or a resumption since
+                then refuses it. By default only one during this call does.
 
         Raises:
             UsageError: There are several plans, or they are of another robot.
         """
-        return self._switch(plan, number("at", at), self._stops)
+        before = self._stops if stops is None else stops
+        return self._switch(plan, number("at", at), before)
 
     @checked_arguments
     def replan(self, make_plan: PlanFunction, at: float) -> Future[Switch]:
@@ -355,9 +366,18 @@ class PlanRuntime:
             if refusal := self._refusal(at, stops):
                 return Switch(refusal, at)
             return self._switch(make_plan(self.state_at(at)), at, stops)
-        except Exception as error:  # noqa: BLE001 - errors of the caller's function are results
+        except (Exception, SystemExit) as error:  # noqa: BLE001 - errors of the caller's function are results
             kind = "" if isinstance(error, CnpgenError) else f"{type(error).__name__}: "
             return Switch(SwitchOutcome.FAILED, at, f"{kind}{error}")
+
+
+def _checked_grid_step(step: float) -> float:
+    low, high = GRID_STEPS_S
+    if not low <= (found := number("grid_step", step)) <= high:
+        raise UsageError(
+            f"must be from {low:g} to {high:g} s, got {found:g} s", argument="grid_step"
+        )
+    return found
 
 
 def _report(motion: SampledMotion, begin: float, detail: str = "") -> Stop:

@@ -14,6 +14,7 @@ from cnpgen.plans.join import JoinedPlans
 from cnpgen.plans.plans import Plans
 
 MAX_GRID_STEP_S = 1e-3
+GRID_STEPS_S = 1e-4, 4e-3  # that a caller may choose
 _QUINTIC = (
     np.array(  # coefficients of 1, x, ..., x^5 from q, dq, ddq at 0 and q, dq, ddq at 1
         [

@@ -60,7 +60,8 @@ def _file(name: str, scene: Path, packages: Sequence[Path], where: str) -> Path:
     """Return a file below the folder of the scene, or below one of the packages."""
     is_package = name.startswith(PACKAGE)
     relative = PurePosixPath(name.removeprefix(PACKAGE))
-    if ":" in str(relative) or relative.is_absolute() or ".." in relative.parts:
+    names_a_file = bool(relative.parts) and ":" not in str(relative)
+    if not names_a_file or relative.is_absolute() or ".." in relative.parts:
         raise SceneError(
             f"{where}: expected a path below the folder of the scene or below --packages,"
             " or package://NAME/PATH"

@@ -108,6 +108,9 @@ def _violation(
 ) -> Iterator[str]:
     """Describe a violation of a measured condition by more than tolerance and margin, see ``BOUNDARY_MARGIN``."""
     g = np.array(condition.g, float)
+    if not g.size:
+        # Distances from obstacles, in a scene without any.
+        return
     phase = np.array([0.0 if end == "start" else 1.0])
     relaxation = float(constraint.bound_relaxation(condition, phase, start_tip)[0])
     bound = np.where(

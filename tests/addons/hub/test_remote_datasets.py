@@ -5,15 +5,18 @@ import subprocess
 import sys
 from collections.abc import Iterator
 from pathlib import Path
+from threading import Event
 
 import numpy as np
 import pytest
 
 import cnpgen
+from cnpgen.addons.hub.downloads import ListedFile, RemoteFolder, _fetch
 from cnpgen.cli.main import main
 from cnpgen.errors import DatasetError, MachineError, MissingExtraError, UsageError
 from cnpgen.loader.dataset import Dataset
 from tests.addons.hub.servers import COMMIT, Files, serve
+from tests.conftest import HANGING
 from tests.examples.loader import ALL, columns, make
 
 fsspec = pytest.importorskip("fsspec")
@@ -228,3 +231,24 @@ def test_a_repository_of_the_hub_is_read_also_offline_from_its_cache(
     code, text = run_with_hub(f"{url}x", home, files.url, HF_HUB_OFFLINE="1")
     assert code == 1
     assert f"MachineError: {url}x cannot be read" in text
+
+
+def test_an_error_ends_the_files_in_transfer(tmp_path: Path) -> None:
+    ended = list[str]()
+
+    class Slow(RemoteFolder):
+        url = "slow://x"
+
+        def save(
+            self, name: str, path: Path, *, max_bytes: int, anew: bool, stop: Event
+        ) -> None:
+            if name == "broken":
+                raise ConnectionError("no answer")
+            assert stop.wait(HANGING)
+            ended.append(name)
+            raise InterruptedError
+
+    files = [ListedFile(name, "") for name in ("slow-1", "slow-2", "broken")]
+    with pytest.raises(MachineError, match="interrupted at"):
+        _fetch(Slow(), tmp_path, files)
+    assert sorted(ended) == ["slow-1", "slow-2"]

@@ -457,3 +457,54 @@ def test_wrong_options_and_shapes_are_refused(controller):
     controller.run(0.2)
     with pytest.raises(UsageError, match="has 9 columns, earlier ones have 8"):
         controller.step(np.zeros((50, 9)))
+
+
+def test_a_stop_during_a_step_refuses_its_chunk_after_the_next_reset(monkeypatch):
+    executor = ChunkExecutor("panda-3kg", **{**OPTIONS, "join": 0.3})
+    controller, motion = Controller(executor), executor._motions.motion
+
+    def stopped_meanwhile(*arguments):
+        executor.stop()
+        controller.run(0.1)
+        executor.reset((HOME, np.zeros(7)))
+        return motion(*arguments)
+
+    monkeypatch.setattr(executor._motions, "motion", stopped_meanwhile)
+    join = controller.step(chunk(0.0))
+    assert join.outcome is SwitchOutcome.STOPPED
+    controller.run(1.0)
+    np.testing.assert_array_equal(controller.points[-1].q, HOME)
+
+
+def test_a_chunk_that_is_refused_does_not_fix_the_columns_and_large_values_are_outliers():
+    executor = ChunkExecutor("panda-3kg", **OPTIONS)
+    controller = Controller(executor)
+    assert controller.step(np.full((LENGTH, 7), np.nan)).outcome is (
+        SwitchOutcome.NOT_FINITE
+    )
+    controller.run(0.01)
+    assert controller.step(1e300 * chunk(0.0)).outcome is SwitchOutcome.OUTLIER
+    with pytest.raises(UsageError, match="earlier ones have 8"):
+        controller.step(chunk(0.0)[:, :7])
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        {"tracking_error": np.inf},
+        {"tracking_error": True},
+        {"stop_after": 1e308},
+        {"stop_after": True},
+    ],
+    ids=str,
+)
+def test_options_that_disable_a_check_are_refused(wrong):
+    with pytest.raises(UsageError) as raised:
+        ChunkExecutor("panda-3kg", **{**OPTIONS, **wrong})
+    assert raised.value.argument in wrong
+
+
+def test_measured_positions_outside_the_limits_are_refused():
+    executor = ChunkExecutor("panda-3kg", **OPTIONS)
+    with pytest.raises(UsageError, match="outside its position limits"):
+        executor.reset((HOME + 3.0, np.zeros(7)))

@@ -1,5 +1,6 @@
 """Execution of plans in time: set-points, switches, refusals and stops, measured with SciPy, Pinocchio and MuJoCo."""
 
+import sys
 import threading
 
 import numpy as np
@@ -17,7 +18,7 @@ from cnpgen.plans.evaluate import evaluate_plans
 from cnpgen.plans.join import JoinedPlans, join_plans
 from cnpgen.problems.problem_record import open_problem
 from cnpgen.results import HitOptions
-from tests.conftest import Arm
+from tests.conftest import HANGING, Arm
 
 TARGET = [2.49, 0.0]  # m
 SHARE = 0.95  # of the maximum hitting speed, so that velocities stay within their limits after the hit
@@ -262,3 +263,19 @@ def test_plans_and_stops_have_the_parameters_of_the_runtime():
         PlanRuntime(planner, start, parameters=[15.0])
     with pytest.raises(UsageError, match=r"must have shape \(1,\)"):
         PlanRuntime(planner, start, parameters=[[5.0], [6.0]])
+
+
+def test_a_planner_that_ends_the_process_is_a_failed_request_and_the_next_one_is_served(
+    planner,
+):
+    with PlanRuntime(planner, planner.robot.home) as runtime:
+        for _ in range(2):
+            found = runtime.replan(lambda _: sys.exit("enough"), 1.0).result(HANGING)
+            assert found.outcome is SwitchOutcome.FAILED
+            assert "enough" in found.detail
+
+
+@pytest.mark.parametrize("step", [1e-8, 0.01])
+def test_grids_that_miss_a_limit_or_fill_the_memory_are_refused(planner, step):
+    with pytest.raises(UsageError, match=r"0\.0001 to 0\.004 s"):
+        PlanRuntime(planner, planner.robot.home, grid_step=step)
