@@ -92,6 +92,13 @@ class Problem:
         "name of the problem: lower-case letters, digits and hyphens", pattern=NAME
     )
     title: str = field("title in one line", default="")
+    version: int = optional_key(
+        "rules of the file: from 2 on, friction in the URDF without"
+        " drive.urdf_dynamics is an error instead of a warning",
+        default=1,
+        low=1,
+        high=2,
+    )
     robot: RobotSpec = field("robot and its planned joints")
     limits: LimitSpec = field(
         "planning limits, as fractions of the URDF's or in their place"
@@ -415,8 +422,8 @@ class Problem:
     def identity(self) -> str:
         """Hash (sha256) of everything that kernels and plans of the problem depend on; the key of caches.
 
-        It depends on the values of the object and not on a file. Only the title and the
-        file paths are excluded.
+        It depends on the values of the object and not on a file. Only the title, the
+        version of the file's rules and the file paths are excluded.
         """
         content = json.dumps(
             without_labels(to_dict(self, label=_all_of)), sort_keys=True
@@ -516,8 +523,8 @@ def _all_of(obj: object) -> dict[str, str]:
 
 
 def without_labels(problem: Mapping[str, Any]) -> dict[str, Any]:
-    """Remove title and file names from a resolved problem, which do not affect its motions."""
+    """Remove title, version and file names from a resolved problem, which do not affect its motions."""
     robot = {key: value for key, value in problem["robot"].items() if key not in FILES}
-    return {key: value for key, value in problem.items() if key != "title"} | {
-        "robot": robot
-    }
+    labels = {"title", "version"}
+    kept = {key: value for key, value in problem.items() if key not in labels}
+    return kept | {"robot": robot}

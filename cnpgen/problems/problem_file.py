@@ -1,6 +1,7 @@
 """Problem files, loaded by name or path, and problems restored from records."""
 
 import os
+import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import replace
@@ -16,7 +17,7 @@ from cnpgen.problems.constraints.constraint import Constraint
 from cnpgen.problems.constraints.joint import JointTorque
 from cnpgen.problems.objectives import ObjectiveTerm
 from cnpgen.problems.problem import FILES, Problem
-from cnpgen.problems.urdf_dynamics import warn_of_friction
+from cnpgen.problems.urdf_dynamics import undecided_friction
 from cnpgen.robots.obstacle import Obstacle
 from cnpgen.robots.shape.inline import inline_mesh, is_inline, mesh_files
 from cnpgen.robots.shape.mesh_files import find_named_file
@@ -100,7 +101,12 @@ def read_problem(path: Path, errors: list[str]) -> Problem | None:
     errors.extend(limit_errors(problem, raw))
     is_stated = "urdf_dynamics" in table.get("drive", {})
     if raw.urdf is not None and problem.first(JointTorque) and not is_stated:
-        warn_of_friction(raw.urdf, problem.robot.joints, path)
+        undecided = undecided_friction(raw.urdf, problem.robot.joints)
+        if undecided and problem.version > 1:
+            errors.append(f"{path}: drive.urdf_dynamics: missing; {undecided}")
+        elif undecided:
+            message = f"{path}: friction of the URDF is ignored; {undecided}"
+            warnings.warn(message, UserWarning, stacklevel=3)
     spec, constraints = (
         replace(problem.robot, geometry=raw.geometry),
         raw.with_object_clearance(problem),

@@ -343,7 +343,7 @@ def _comparable(record: ProblemRecord) -> dict[str, Any]:
     kept = {
         key: value
         for key, value in record.content.items()
-        if key not in {"name", "title", "trajectory", "objective"}
+        if key not in {"name", "title", "version", "trajectory", "objective"}
     }
     robot = {
         key: value

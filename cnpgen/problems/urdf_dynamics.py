@@ -6,10 +6,8 @@ use nor disregard is a silent default.
 """
 
 import math
-import warnings
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from xml.etree.ElementTree import Element
 
 from cnpgen.errors import RecipeError
@@ -57,21 +55,18 @@ def suggested_use(frictions: Sequence[JointFriction], joints: int) -> str:
     return "ignore" if placeholders or large else "use"
 
 
-def warn_of_friction(tree: Element, planned: Sequence[str], path: Path) -> None:
-    """Warn that the friction of planned joints is ignored, since a problem file does not state what to do with it."""
+def undecided_friction(tree: Element, planned: Sequence[str]) -> str | None:
+    """Describe the friction of planned joints and how a problem file chooses what to do with it; None without any."""
     try:
         every = urdf_parameters(tree).joints.values()
     except RecipeError:
         # Loading the robot raises it.
-        return
-    if frictions := friction_in([each for each in every if each.name in planned]):
-        listing = ", ".join(map(str, frictions))
-        warnings.warn(
-            f"{path}: friction of the URDF is ignored: {listing}; write urdf_dynamics ="
-            ' "use" or "ignore" in [drive] to choose',
-            UserWarning,
-            stacklevel=4,
-        )
+        return None
+    if not (frictions := friction_in([each for each in every if each.name in planned])):
+        return None
+    listing = ", ".join(map(str, frictions))
+    choice = 'write urdf_dynamics = "use" or "ignore" in [drive] to choose'
+    return f"the URDF has {listing}; {choice}"
 
 
 def joint_notes(

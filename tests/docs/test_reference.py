@@ -18,7 +18,7 @@ from tests.test_public_names import MODULES
 ROOT = Path(__file__).parents[2]
 DOCS = ROOT / "docs"
 MADE = "cli", "keys"  # pages from the code, which the site writes to docs/reference/
-MAX_BYTES = 450_000  # of all Markdown in the wheel
+MAX_BYTES = 460_000  # of all Markdown in the wheel
 MIN_PICTURE_TEXT = 20  # [characters] a description, not a name
 
 

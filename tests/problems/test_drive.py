@@ -9,6 +9,7 @@ import numpy as np
 import pinocchio as pin
 import pytest
 
+from cnpgen.cli.main import main
 from cnpgen.errors import RecipeError
 from cnpgen.judges.plans.plan_plot import shares_of_limits
 from cnpgen.kernels.symbolic.symbolic_state import SymbolicState
@@ -316,6 +317,29 @@ def test_a_problem_that_ignores_friction_is_the_same_problem(tmp_path: Path) -> 
     robot = load_robot(ignored)
     assert robot.drive is None
     assert judged_torque(ignored.constraint, robot) == "rigid body"
+
+
+def test_a_file_of_version_2_must_say_what_to_do_with_the_friction(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with pytest.warns(UserWarning, match="friction of the URDF is ignored"):
+        unstated = arm(tmp_path)
+    ignored = arm(tmp_path, '[drive]\nurdf_dynamics = "ignore"')
+    file = tmp_path / "problem.toml"
+    file.write_text("version = 2\n" + file.read_text())
+    assert load_problem(file).identity == unstated.identity == ignored.identity
+    assert record_problem(load_problem(file)).comparable_sha256 == (
+        record_problem(unstated).comparable_sha256
+    )
+    text = file.read_text().replace('urdf_dynamics = "ignore"', "armature = 0.5")
+    file.write_text(text)
+    assert main(["show", str(file)]) == 2
+    error = " ".join(capsys.readouterr().err.split())
+    assert "drive.urdf_dynamics: missing; the URDF has " in error
+    assert "j4 (damping 15" in error
+    assert 'write urdf_dynamics = "use" or "ignore" in [drive]' in error
+    file.write_text(text.replace("version = 2", "version = 3"))
+    assert main(["show", str(file)]) == 2
 
 
 def test_the_record_of_a_problem_keeps_its_drives(tmp_path: Path) -> None:

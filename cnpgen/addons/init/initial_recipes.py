@@ -168,6 +168,7 @@ def _problem(
     return Problem(
         name=name,
         title=title,
+        version=2,
         robot=robot,
         limits=limits,
         drive=DriveSpec(urdf_dynamics=arm.urdf_dynamics) if arm.friction else NO_DRIVE,

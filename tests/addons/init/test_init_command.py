@@ -876,6 +876,7 @@ def test_the_choice_about_friction_of_the_urdf_is_written_with_its_shares(
     )
     text = (tmp_path / "made" / "problem.toml").read_text()
     assert tomllib.loads(text)["drive"] == {"urdf_dynamics": choice}
+    assert tomllib.loads(text)["version"] == 2
     robot = load_robot(load_problem(tmp_path / "made" / "problem.toml"))
     assert (robot.drive is not None) == (choice == "use")
     np.testing.assert_allclose(robot.position_upper, 1)
