@@ -1,5 +1,6 @@
 """The example for ROS 2: its logic runs against a controller that a program plays, and its node compiles."""
 
+import re
 import shutil
 import subprocess
 from pathlib import Path
@@ -14,10 +15,9 @@ from tests.addons.deploy.ros2_declarations import definitions, header, write_hea
 
 CXX = next(filter(None, map(shutil.which, ("c++", "g++", "clang++"))), None)
 CC = next(filter(None, map(shutil.which, ("cc", "gcc", "clang"))), None)
-pytestmark = [
-    pytest.mark.slow,
-    pytest.mark.skipif(None in (CXX, CC), reason="there is no C++ compiler here"),
-]
+needs_compilers = pytest.mark.skipif(
+    None in (CXX, CC), reason="there is no C++ compiler on this machine"
+)
 EXAMPLE = Path(__file__).parents[3] / "docs" / "examples" / "ros2"
 HERE = Path(__file__).parent / "ros2"
 WARNINGS = ("-std=c++17", "-Wall", "-Wextra", "-Werror")
@@ -71,6 +71,8 @@ def rows_of(problem: str, rest: bool, count: int) -> np.ndarray:
     return np.concatenate(columns, axis=1)
 
 
+@pytest.mark.slow
+@needs_compilers
 def test_transports_are_run_stopped_and_refused(tmp_path):
     rows = rows_of("heavy-object", rest=False, count=12)
     planned, stops, ends = played("heavy-object", tmp_path, rows, rest=False)
@@ -79,6 +81,8 @@ def test_transports_are_run_stopped_and_refused(tmp_path):
     assert ends >= planned  # near the end of every motion
 
 
+@pytest.mark.slow
+@needs_compilers
 def test_a_hit_ends_at_rest_by_a_second_motion(tmp_path):
     rows = rows_of("airhockey-hit", rest=True, count=24)
     planned, stops, ends = played("airhockey-online", tmp_path, rows, rest=True)
@@ -87,6 +91,8 @@ def test_a_hit_ends_at_rest_by_a_second_motion(tmp_path):
     assert stops + ends == 7 * planned
 
 
+@pytest.mark.slow
+@needs_compilers
 def test_the_node_compiles_against_the_published_interfaces(tmp_path):
     published = (HERE / "interfaces.txt").read_text(encoding="utf-8")
     own = (EXAMPLE / "action" / "PlanMotion.action").read_text(encoding="utf-8")
@@ -94,6 +100,11 @@ def test_the_node_compiles_against_the_published_interfaces(tmp_path):
     interfaces["cnpgen_planner/action/PlanMotion"] = own
     write_headers(interfaces, tmp_path)
     exported("heavy-object", tmp_path / "planner")
+    own_header = (tmp_path / "planner" / "heavy_object.h").read_text(encoding="utf-8")
+    codes = re.findall(r"#define HEAVY_OBJECT_(\w+) (\d) /\*", own_header)
+    names = (tmp_path / "planner" / "planner.hpp").read_text(encoding="utf-8")
+    written = re.findall(r'"([A-Z_]+)"', names)
+    assert codes == [(name, str(code)) for code, name in enumerate(written)]
     folders = (tmp_path, tmp_path / "planner", HERE / "include", EXAMPLE / "src")
     node = EXAMPLE / "src" / "plan_motion_node.cpp"
     include = [f"-I{folder}" for folder in folders]
@@ -109,3 +120,16 @@ def test_the_node_compiles_against_the_published_interfaces(tmp_path):
 def test_a_type_without_a_definition_is_refused():
     with pytest.raises(ValueError, match="std_msgs/Missing"):
         header("a/msg/B", "std_msgs/Missing value", set())
+
+
+def test_the_readme_has_the_parameters_of_the_node_and_their_defaults():
+    node = (EXAMPLE / "src" / "plan_motion_node.cpp").read_text(encoding="utf-8")
+    readme = (EXAMPLE / "README.md").read_text(encoding="utf-8")
+    table = readme.partition("| parameter |")[2].partition("\n\n")[0]
+    parameters = re.findall(r"declare_parameter(?:<[\w:]+>)?\(\s*\"(\w+)\"", node)
+    assert sorted(re.findall(r"`(\w+)`", table.replace("joint_states", ""))) == sorted(
+        [*parameters, "start_q"]
+    )
+    for name, default in re.findall(r"<double>\(\"(\w+)\", ([\d.]+)\)", node):
+        row = next(line for line in table.splitlines() if f"`{name}`" in line)
+        assert default in re.findall(r"[\d.]+", row)
