@@ -91,6 +91,7 @@ OTHERS = (
     "datasets/**",
     "pipelines/**",
     "problems/**",
+    "docs/examples/ros2/README",
 )
 
 
