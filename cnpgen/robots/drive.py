@@ -13,6 +13,7 @@ from functools import cached_property
 import numpy as np
 
 from cnpgen.arrays import Array
+from cnpgen.errors import counted
 from cnpgen.robots.parameter_ranges import optional_key
 from cnpgen.schema.keys import PerJoint, field
 
@@ -192,7 +193,7 @@ class Drive:
     def summary(self) -> str:
         """Description of the torque that is judged, in a few words."""
         sides = {"both": "both sides", "joint": "the joint", "motor": "the motor"}
-        more = [f"{len(self.lines)} torque-speed lines"] if self.lines else []
+        more = [counted(len(self.lines), "torque-speed line")] if self.lines else []
         more += ["power"] if self.power_limit is not None else []
         limits = ", ".join([f"limits on {sides[self.limits]}", *more])
         return f"rigid body and drives, {limits}"

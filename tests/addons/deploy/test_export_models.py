@@ -29,6 +29,8 @@ def test_a_model_becomes_a_source_a_header_and_a_readme(tmp_path: Path, capsys):
     header = (out / "my_hits.h").read_text()
     assert "my_hits_plan(const my_hits_request" in header
     assert load_model(file).problem.comparable_sha256 in header
+    assert main(["export", str(file), "--to", "c", "-o", str(out)]) == 0
+    (out / "my_hits.h").write_text("changed")
     assert main(["export", str(file), "--to", "c", "-o", str(out)]) == 2
     assert "--force" in capsys.readouterr().err
     assert main(["export", str(file), "--to", "c", "-o", str(out), "--force"]) == 0
