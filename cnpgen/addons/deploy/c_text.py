@@ -14,13 +14,51 @@ NUMBERS_PER_LINE = 10
 _SAFE_IN_COMMENT = re.compile(r"[^A-Za-z0-9 _.,:;()+=<>%@#|~^-]")
 
 
+# Of C11: a file NAME.h of the same name would hide one of them.
+STANDARD_HEADERS = frozenset(
+    [
+        "assert",
+        "complex",
+        "ctype",
+        "errno",
+        "fenv",
+        "float",
+        "inttypes",
+        "iso646",
+        "limits",
+        "locale",
+        "math",
+        "setjmp",
+        "signal",
+        "stdalign",
+        "stdarg",
+        "stdatomic",
+        "stdbool",
+        "stddef",
+        "stdint",
+        "stdio",
+        "stdlib",
+        "stdnoreturn",
+        "string",
+        "tgmath",
+        "threads",
+        "time",
+        "uchar",
+        "wchar",
+        "wctype",
+    ]
+)
+
+
 def identifier(text: str) -> str:
     """Map a name to [a-z0-9_], beginning with a letter: the prefix of all names of a planner."""
     name = re.sub(r"[^a-z0-9]+", "_", text.lower()).strip("_")[:MAX_PREFIX_LENGTH]
     name = name.rstrip("_")
     if not name:
         return FALLBACK_NAME
-    return name if name[0].isalpha() else f"{FALLBACK_NAME}_{name}"[:MAX_PREFIX_LENGTH]
+    if name[0].isalpha() and name not in STANDARD_HEADERS:
+        return name
+    return f"{FALLBACK_NAME}_{name}"[:MAX_PREFIX_LENGTH]
 
 
 def comment_text(text: str) -> str:

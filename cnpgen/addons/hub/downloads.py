@@ -5,6 +5,7 @@ or absent: files are collected in a folder beside it, which is renamed when all 
 there. An interrupted download continues at the byte where it stopped.
 """
 
+import shutil
 import time
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Sequence
@@ -86,6 +87,8 @@ def local_copy(remote: RemoteFolder, manifest: bytes, folder: Path) -> Path:
             write_file(unfinished / MANIFEST, manifest)
             _download(remote, unfinished)
             with machine_errors("write", folder):
+                # A copy without its manifest is no copy.
+                shutil.rmtree(folder, ignore_errors=True)
                 unfinished.replace(folder)
     return folder
 

@@ -33,6 +33,7 @@ HOSTILE = (
         ("airhockey-hit", "airhockey_hit"),
         ("Mine 2", "mine_2"),
         ("2nd", "planner_2nd"),
+        ("math", "planner_math"),
         ("日本", "planner"),
         ("", "planner"),
         ("__x__", "x"),

@@ -114,6 +114,13 @@ def test_damaged_bytes_are_refused_and_a_repaired_server_is_read(files: Files) -
     assert_has_all_rows(cnpgen.load_dataset(f"{files.url}/data/hits"))
 
 
+def test_a_copy_without_its_manifest_is_downloaded_again(files: Files) -> None:
+    first = cnpgen.load_dataset(f"{files.url}/data/hits")
+    (first.folder / "manifest.json").unlink()
+    (first.folder / "train" / "shard-00001.h5").write_bytes(b"damaged")
+    assert_has_all_rows(cnpgen.load_dataset(f"{files.url}/data/hits"))
+
+
 def test_a_longer_file_is_not_downloaded_beyond_its_recorded_size(
     files: Files, cache: Path
 ) -> None:
