@@ -15,38 +15,10 @@ _SAFE_IN_COMMENT = re.compile(r"[^A-Za-z0-9 _.,:;()+=<>%@#|~^-]")
 
 
 # Of C11: a file NAME.h of the same name would hide one of them.
-STANDARD_HEADERS = frozenset(
-    [
-        "assert",
-        "complex",
-        "ctype",
-        "errno",
-        "fenv",
-        "float",
-        "inttypes",
-        "iso646",
-        "limits",
-        "locale",
-        "math",
-        "setjmp",
-        "signal",
-        "stdalign",
-        "stdarg",
-        "stdatomic",
-        "stdbool",
-        "stddef",
-        "stdint",
-        "stdio",
-        "stdlib",
-        "stdnoreturn",
-        "string",
-        "tgmath",
-        "threads",
-        "time",
-        "uchar",
-        "wchar",
-        "wctype",
-    ]
+STANDARD_HEADER = re.compile(
+    "assert|complex|ctype|errno|fenv|float|inttypes|iso646|limits|locale|math|setjmp"
+    "|signal|stdalign|stdarg|stdatomic|stdbool|stddef|stdint|stdio|stdlib|stdnoreturn"
+    "|string|tgmath|threads|time|uchar|wchar|wctype"
 )
 
 
@@ -56,7 +28,7 @@ def identifier(text: str) -> str:
     name = name.rstrip("_")
     if not name:
         return FALLBACK_NAME
-    if name[0].isalpha() and name not in STANDARD_HEADERS:
+    if name[0].isalpha() and not STANDARD_HEADER.fullmatch(name):
         return name
     return f"{FALLBACK_NAME}_{name}"[:MAX_PREFIX_LENGTH]
 
