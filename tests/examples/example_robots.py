@@ -33,7 +33,7 @@ SHIPPED = ("panda-cup", "ur5-wipe")  # problems, pipelines and datasets of these
 
 def with_robots(names: Iterable[str]) -> list[Any]:
     """The names of recipes as parameters of a test, those of robots that are not installed to be skipped."""
-    own = (*SHIPPED, "panda-scenes")
+    own = (*SHIPPED, "panda-scenes", "panda-scenes-drive")
     return [
         pytest.param(name, marks=needs_robots) if name in own else name
         for name in names

@@ -23,7 +23,14 @@ from tests.examples.models import untrained_model
 from tests.examples.shipped import PROBLEMS
 
 # Names, locations of files, how they are read and what was measured: only their content counts.
-LABELS = {"title", "robot.urdf", "robot.srdf", "robot.convex_parts", "robot.hull_gap"}
+LABELS = {
+    "title",
+    "version",
+    "robot.urdf",
+    "robot.srdf",
+    "robot.convex_parts",
+    "robot.hull_gap",
+}
 
 
 PLUGGED = "with a plug-in"

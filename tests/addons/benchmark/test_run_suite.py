@@ -47,6 +47,7 @@ from cnpgen.addons.trajectories.sampled_trajectory import Trajectory
 from cnpgen.errors import DatasetError, UsageError
 from cnpgen.schema.catalogue import list_recipes
 from tests.conftest import some
+from tests.examples.example_robots import needs_robots
 from tests.examples.grouped import grouped
 from tests.examples.installed import installed_kind
 
@@ -418,7 +419,9 @@ def test_an_unsuitable_planner_is_reported_as_not_applicable(tmp_path: Path) -> 
     assert on_a_plant["applicability"] == ["not executed", "not applicable"]
 
 
-@pytest.mark.parametrize("suite", ["hits-81", "heavy-100", "clutter"])
+@pytest.mark.parametrize(
+    "suite", ["hits-81", "heavy-100", pytest.param("clutter", marks=needs_robots)]
+)
 def test_tables_have_only_what_applies_to_their_suite(suite: str) -> None:
     problems = load_suite(suite).problems(1)[0]
     row = {"answer": None, "ending": "no plan", "error": "", "problem": 0}
