@@ -58,6 +58,7 @@ from cnpgen.store.files.accounted import (
     accounted,
     is_default,
     mark_read,
+    misspelt,
 )
 
 _KEYS = {"collision_objects", "goal_constraints", "start_state", "world"}
@@ -101,7 +102,13 @@ def read_moveit(
             for file in (scene_path, path)
         )
         own = scene if scene_path == path else own
-        problem = _problem(scene_path, scene, path, own, options.present)
+        try:
+            problem = _problem(scene_path, scene, path, own, options.present)
+        except SceneError as error:
+            if not (unknown := misspelt(scene, own)):
+                raise
+            text = f"{error.args[0]}; {unknown}"
+            raise SceneError(text, remedies=error.remedies) from error
         account.finish(scene, *([] if own is scene else [own]))
         request = replace(problem.request, accepted=tuple(account.accepted))
         yield replace(problem, request=request), account

@@ -18,6 +18,7 @@ from cnpgen.errors import UsageError, counted, listed, nearest
 
 ALLOW_UNUSED = "allow_unused"  # argument that accepts the loss of an element by name
 MAX_REPORTED = 10  # elements that one error names
+MISSPELT = 0.75  # least share of equal letters of a misspelt key
 
 
 @dataclass(frozen=True)
@@ -105,6 +106,16 @@ class Account:
             )
 
 
+def misspelt(*documents: AccountedMapping) -> str:
+    """Describe the elements not read so far whose names are near one that is missing beside them; empty without any.
+
+    A misspelt key looks like a missing one, and an error about the latter ends the
+    reading.
+    """
+    found = [text for document in documents for text in document.misspelt()]
+    return f"unknown: {listed(found, MAX_REPORTED)}" if found else ""
+
+
 class AccountedMapping(dict[str, Any]):
     """Mapping that records which of its keys were read."""
 
@@ -154,6 +165,16 @@ class AccountedMapping(dict[str, Any]):
             elif isinstance(value, AccountedMapping | AccountedList):
                 yield from value.unread()
 
+    def misspelt(self) -> Iterator[str]:
+        """Yield the paths of elements that were not read, each with a name near it that the mapping lacks."""
+        missing = sorted((self._read | self._known) - set(dict.keys(self)))
+        for key, value in dict.items(self):
+            if key not in self._read:
+                if hint := nearest(key, missing, similarity=MISSPELT):
+                    yield (f"{self.path}.{key}" if self.path else key) + hint
+            elif isinstance(value, AccountedMapping | AccountedList):
+                yield from value.misspelt()
+
 
 class AccountedList(list[Any]):
     """List that records which of its entries were read; an iteration reads all."""
@@ -177,6 +198,12 @@ class AccountedList(list[Any]):
             else [index % len(self) if len(self) else index]
         )
         return super().__getitem__(index)
+
+    def misspelt(self) -> Iterator[str]:
+        """Yield those of the entries, see ``AccountedMapping.misspelt``."""
+        for value in list.__iter__(self):
+            if isinstance(value, AccountedMapping | AccountedList):
+                yield from value.misspelt()
 
     def unread(self) -> Iterator[tuple[str, set[str]]]:
         """Yield the paths of the outermost entries that were not read."""

@@ -193,6 +193,23 @@ def test_a_misspelt_key_is_refused_with_the_nearest_name_at_every_place() -> Non
         read(changed(content, ("world", "collison_objects"), []))
 
 
+@pytest.mark.parametrize(
+    ("place", "wrong"),
+    [
+        (("world", "collision_objects", 0, "primitives", 0, "dimensions"), "dimension"),
+        (("start_state", "joint_state", "position"), "positon"),
+        (("start_state", "joint_state"), "joint_states"),
+    ],
+    ids=str,
+)
+def test_a_misspelt_key_is_named_where_its_absence_is_an_error(place, wrong) -> None:
+    content = document()
+    values = value_at(content, place[:-1])
+    values[wrong] = values.pop(place[-1])
+    with pytest.raises(UsageError, match=rf"{wrong} \(did you mean '{place[-1]}'\?\)"):
+        read(content)
+
+
 OTHER = {  # entry of the tables -> place in the document, and another value
     ".name": (("name",), "cellar"),
     ".object_colors": (("object_colors",), []),
