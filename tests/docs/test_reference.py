@@ -219,7 +219,7 @@ def test_the_pictures_of_the_concepts_are_drawn_from_computed_plans(
     monkeypatch.setattr(pictures, "FOLDER", tmp_path)
     pictures.main()
     drawn = {path.name for path in tmp_path.iterdir()}
-    assert len(drawn) == 5
+    assert len(drawn) == 6
     text = "".join(
         page.read_text(encoding="utf-8") for page in (DOCS / "concepts").glob("*.md")
     )

@@ -135,4 +135,8 @@ def test_a_file_that_cannot_grow_is_reported_in_one_line_and_the_same_command_re
     ]
     assert main([*words, "--quiet"]) == 0
     assert same(load_plans(out), solved)
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["out.h5", "problems.h5"]
+    assert sorted(path.name for path in tmp_path.iterdir()) == [
+        ".out.h5.request",
+        "out.h5",
+        "problems.h5",
+    ]

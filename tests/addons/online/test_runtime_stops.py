@@ -20,6 +20,7 @@ from cnpgen.plans.evaluate import evaluate_plans
 from cnpgen.problems.problem_record import open_problem
 from cnpgen.refine.refine_plans import solve_plans
 from tests.conftest import some
+from tests.examples.example_robots import needs_robots
 from tests.faults.stop_orders import check_states, run_orders, valid_plans
 
 TARGET = [2.49, 0.0]  # m
@@ -91,7 +92,10 @@ def test_stops_of_transports_and_among_obstacles_are_valid(name):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["heavy-object-drive", "panda-scenes-drive"])
+@pytest.mark.parametrize(
+    "name",
+    ["heavy-object-drive", pytest.param("panda-scenes-drive", marks=needs_robots)],
+)
 def test_stops_of_arms_with_drives_are_within_the_limits_of_the_motors(name):
     """Nearly all stops end before their motion, with the first time law, by Pinocchio with rotors and exact friction."""
     plans = solve_plans(draw_boundary_problems(name, 5, seed=5), workers=1).plans
