@@ -103,12 +103,11 @@ def download(url: str) -> Path:
         text = f"{url:.200}: expected the URL of a folder, without a query or an anchor"
         raise UsageError(text, concerns="folder")
     remote = _open_folder(url.rstrip("/"))
-    cache_key, url = url, remote.url
     for folder in (remote, replace(remote, path=f"{remote.path}/{HDF5}")):
         if manifest := _read_manifest(folder):
-            return local_copy(folder, manifest, _cache_folder(cache_key, manifest))
+            return local_copy(folder, manifest, _cache_folder(url, manifest))
     raise DatasetError(
-        f"{url} has no finished dataset: neither {MANIFEST} nor {HDF5}/{MANIFEST}"
+        f"{remote.url} has no finished dataset: neither {MANIFEST} nor {HDF5}/{MANIFEST}"
     )
 
 

@@ -33,7 +33,13 @@ from cnpgen.plans.plans import Plans
 from cnpgen.problems.problem import Problem
 from cnpgen.problems.problem_record import as_record, open_problem
 from cnpgen.schema.argument_types import checked_arguments
-from cnpgen.schema.arguments import concerning, distinct, number, numbers
+from cnpgen.schema.arguments import (
+    check_range,
+    concerning,
+    distinct,
+    number,
+    numbers,
+)
 from cnpgen.store.dataset_spec import StoredProblem
 
 PlanFunction = Callable[[SetPoint], Executable | None]
@@ -102,13 +108,14 @@ class PlanRuntime:
                 planner.model.problem if isinstance(planner, Planner) else planner
             )
         self._robot = robot = open_problem(record)[1]
+        check_range("grid_step", number("grid_step", grid_step), *GRID_STEPS_S, "s")
         self._judge, self._checker = judge, MotionChecker()
         self._admission = Admission(
             record,
             parameters,
             judge=judge,
             checker=self._checker,
-            grid_step=_checked_grid_step(grid_step),
+            grid_step=grid_step,
         )
         self._timeline = Timeline(
             at_rest(_checked_positions("q", q, robot.n), number("time", time)),
@@ -369,15 +376,6 @@ class PlanRuntime:
         except (Exception, SystemExit) as error:  # noqa: BLE001 - errors of the caller's function are results
             kind = "" if isinstance(error, CnpgenError) else f"{type(error).__name__}: "
             return Switch(SwitchOutcome.FAILED, at, f"{kind}{error}")
-
-
-def _checked_grid_step(step: float) -> float:
-    low, high = GRID_STEPS_S
-    if not low <= (found := number("grid_step", step)) <= high:
-        raise UsageError(
-            f"must be from {low:g} to {high:g} s, got {found:g} s", argument="grid_step"
-        )
-    return found
 
 
 def _report(motion: SampledMotion, begin: float, detail: str = "") -> Stop:
