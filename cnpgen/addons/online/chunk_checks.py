@@ -16,7 +16,7 @@ from cnpgen.judges.plans.joint_limits import joint_limits
 from cnpgen.problems.constraints.joint import JointPosition
 from cnpgen.problems.problem import Problem
 from cnpgen.robots.robot import Robot
-from cnpgen.schema.arguments import number, numbers
+from cnpgen.schema.arguments import check_range, number, numbers
 from cnpgen.world.path import PathWorld
 
 MIN_CHUNK_SAMPLES = 8  # of a chunk after the join: fewer have no reliable velocity
@@ -77,12 +77,10 @@ class ChunkChecks:
         return f"{found[0].margin.name}: {found[0].detail}" if found else ""
 
 
-def bounded(name: str, value: float, low: float, high: float) -> float:
-    """Return an argument as a number from a least to a largest value."""
-    if not low <= (found := number(name, value)) <= high:
-        raise UsageError(
-            f"must be from {low:g} to {high:g}, got {found:g}", argument=name
-        )
+def bounded(name: str, value: float, low: float, high: float, unit: str) -> float:
+    """Return an argument as a number from a least to a largest value in a unit."""
+    found = number(name, value)
+    check_range(name, found, low, high, unit)
     return found
 
 

@@ -101,17 +101,17 @@ class ChunkExecutor:
     ) -> None:
         self._record = as_record(problem)
         opened, self._robot = open_problem(self._record)
-        self._rate = bounded("rate", rate, *RATES_HZ)
-        self._join = bounded("join", join, *TIMES_S)
+        self._rate = bounded("rate", rate, *RATES_HZ, "Hz")
+        self._join = bounded("join", join, *TIMES_S, "s")
         self._length = integer(
             "length", length, least=MIN_CHUNK_SAMPLES, most=MAX_CHUNK_SAMPLES
         )
         self._max_distance = positive("max_distance", max_distance)
-        self._stale_after = bounded("stale_after", stale_after, *TIMES_S)
+        self._stale_after = bounded("stale_after", stale_after, *TIMES_S, "s")
         self._tracking_error = checked_errors(tracking_error, self._robot.n)
-        max_speed = bounded("speed", speed, 1.0, MAX_SPEED)
+        max_speed = bounded("speed", speed, 1.0, MAX_SPEED, "times the own one")
         if stop_after is not None:
-            stop_after = bounded("stop_after", stop_after, *TIMES_S)
+            stop_after = bounded("stop_after", stop_after, *TIMES_S, "s")
         self._horizon = horizon(stop_after, self._length, self._rate)
         self._checks = ChunkChecks(
             opened,
