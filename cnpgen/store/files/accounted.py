@@ -167,7 +167,7 @@ class AccountedMapping(dict[str, Any]):
 
     def misspelt(self) -> Iterator[str]:
         """Yield the paths of elements that were not read, each with a name near it that the mapping lacks."""
-        missing = sorted((self._read | self._known) - set(dict.keys(self)))
+        missing = sorted((self._read | self._known).difference(self))
         for key, value in dict.items(self):
             if key not in self._read:
                 if hint := nearest(key, missing, similarity=MISSPELT):
