@@ -31,7 +31,10 @@ from cnpgen.addons.scene_files.moveit_goals import (
     read_joint_goals,
     read_start,
 )
-from cnpgen.addons.scene_files.moveit_meshes import with_mesh_files
+from cnpgen.addons.scene_files.moveit_meshes import (
+    warn_of_unneeded_packages,
+    with_mesh_files,
+)
 from cnpgen.addons.scene_files.moveit_objects import (
     add_object_frames,
     placed_attached,
@@ -43,6 +46,7 @@ from cnpgen.addons.scene_files.moveit_path import read_path_constraints
 from cnpgen.addons.scene_files.moveit_shapes import built
 from cnpgen.addons.scene_files.moveit_unused import UNUSED_ELEMENTS
 from cnpgen.addons.scene_files.octomap import read_octomap
+from cnpgen.errors import listed, nearest
 from cnpgen.problems.scenes.scene_problem import (
     MAX_SCENE_OBSTACLES,
     SceneError,
@@ -53,6 +57,7 @@ from cnpgen.problems.scenes.scene_request import SceneRequest
 from cnpgen.problems.scenes.yaml_document import part, scalar
 from cnpgen.robots.obstacle import Obstacle
 from cnpgen.store.files.accounted import (
+    MISSPELT,
     Account,
     AccountedMapping,
     accounted,
@@ -78,40 +83,63 @@ def read_moveit(
     folder whose name differs by "request" and "scene" only: ``request0001.yaml`` and
     ``scene0001.yaml``. A scene without a request is an error.
     """
+    warn_of_unneeded_packages(documents, options.packages)
     for path, document in documents.items():
         is_scene = "collision_objects" in document or "world" in document
         if "goal_constraints" not in document:
-            if is_scene and _partner(path, "scene", "request") not in documents:
-                raise SceneError(
-                    f"{path}: the scene has no request with goal_constraints in this file or beside it"
-                )
-            continue
+            if is_scene and _partner(path, "scene", "request") in documents:
+                continue
+            what = "scene" if is_scene else "start_state"
+            raise SceneError(
+                f"{path}: the {what} has no request with goal_constraints in this file or beside it"
+                f"{_hint(document, 'goal_constraints')}"
+            )
         scene_path = path if is_scene else _partner(path, "request", "scene")
         if scene_path not in documents:
             raise SceneError(
                 f"{path}: there is no scene {scene_path.name} beside the request"
+                f"{_hint(document, 'world', 'collision_objects')}"
             )
+        yield _read_pair(scene_path, path, documents, options)
+
+
+def _hint(document: Mapping[str, Any], *missing: str) -> str:
+    """Return the keys of a document that are probably a missing one, misspelt."""
+    hints = (nearest(key, missing, similarity=MISSPELT) for key in document)
+    found = [f"{key}{hint}" for key, hint in zip(document, hints, strict=True) if hint]
+    return f"; unknown: {listed(found)}" if found else ""
+
+
+def _read_pair(
+    scene_path: Path, path: Path, documents: dict[Path, Any], options: ReadingOptions
+) -> tuple[SceneProblem, Account]:
+    """Return the problem of a scene and a request, which may be one document, with its account."""
+    parts = []
+    for file in dict.fromkeys((scene_path, path)):
         account = Account(
-            f"{scene_path}",
+            f"{file}",
             UNUSED_ELEMENTS,
             allow_unused=options.allow_unused,
             error=SceneError,
         )
-        scene, own = (
-            accounted(with_mesh_files(documents[file], file, options.packages), account)
-            for file in (scene_path, path)
-        )
-        own = scene if scene_path == path else own
-        try:
-            problem = _problem(scene_path, scene, path, own, options.present)
-        except SceneError as error:
-            if not (unknown := misspelt(scene, own)):
-                raise
-            text = f"{error.args[0]}; {unknown}"
-            raise SceneError(text, remedies=error.remedies) from error
-        account.finish(scene, *([] if own is scene else [own]))
-        request = replace(problem.request, accepted=tuple(account.accepted))
-        yield replace(problem, request=request), account
+        content = with_mesh_files(documents[file], file, options.packages)
+        parts.append(accounted(content, account))
+    scene, own = parts[0], parts[-1]
+    try:
+        problem = _problem(scene_path, scene, path, own, options.present)
+    except SceneError as error:
+        if not (unknown := misspelt(*parts)):
+            raise
+        text = f"{error.args[0]}; {unknown}"
+        raise SceneError(text, remedies=error.remedies) from error
+    for each in parts:
+        each.account.finish(each)
+    account = scene.account
+    if own is not scene:
+        account.unused += own.account.unused
+        account.accepted += own.account.accepted
+    request = replace(problem.request, accepted=tuple(account.accepted))
+    return replace(problem, request=request), account
 
 
 def _partner(path: Path, old: str, new: str) -> Path:

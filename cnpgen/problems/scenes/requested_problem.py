@@ -53,6 +53,11 @@ def requested_problem(
         mass = number("payload", payload)
         check_range("payload", mass, MIN_PAYLOAD_KG, MAX_PAYLOAD_KG, "kg")
     first = scenes[0]
+    if payload is not None and all(item.mass for item in first.request.attached):
+        _LOG.warning(
+            "the payload of %g kg is not used: no scene attaches an object of weight 0",
+            payload,
+        )
     _report_held_joints(problem, scenes)
     for scene in scenes:
         if scene.request.changes != first.request.changes:
