@@ -45,6 +45,7 @@ from cnpgen.robots.urdf_changes import (
     with_payload_link,
     with_point_masses,
 )
+from cnpgen.robots.urdf_elements import check_elements
 from cnpgen.schema import registry
 from cnpgen.schema.argument_types import checked_arguments
 from cnpgen.schema.keys import NAME, Range, field, to_dict
@@ -396,9 +397,10 @@ class Problem:
             return self.same_robot.urdf_text
         spec = self.robot
         positions = dict(zip(spec.locked_joints, spec.locked_positions, strict=True))
-        text = with_locked_joints(
-            read_urdf(self.urdf_path), positions, is_stored=self.is_stored
-        )
+        text = read_urdf(self.urdf_path)
+        if not self.is_stored:
+            check_elements(text, self.urdf_path)
+        text = with_locked_joints(text, positions, is_stored=self.is_stored)
         text = with_point_masses(text)
         if not self.uses_link_geometry:
             return text

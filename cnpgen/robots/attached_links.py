@@ -29,6 +29,14 @@ def attached_link_name(name: str) -> str:
     return f"attached {name}"
 
 
+def root_link(urdf: str) -> str:
+    """Return the name of the link that is no child."""
+    robot = urdf_tree(urdf)
+    children = {child.get("link") for child in robot.iterfind("joint/child")}
+    links = (link.get("name", "") for link in robot.findall("link"))
+    return next(link for link in links if link not in children)
+
+
 def with_attached_link(
     urdf: str,
     name: str,

@@ -13,11 +13,20 @@ from cnpgen.robots.robot_spec import Payload, RobotSpec
 from cnpgen.robots.shape.convex_part import turned
 from cnpgen.robots.urdf import number_in, numbers_in, numbers_text, read_urdf, urdf_tree
 from cnpgen.robots.urdf_parameters import placement_of
+from cnpgen.store.files.accounted import MISSPELT
 
 _TURNING, _SLIDING = ("revolute", "continuous"), ("prismatic",)
 # Elements of a joint that moves.
 _MOTION = "axis", "limit", "mimic", "calibration", "dynamics", "safety_controller"
 _TAG, _PAIR = "disable_collisions", ("link1", "link2")
+_PAIR_KEYS = (*_PAIR, "reason")
+_NO_DEFAULT = "disable_default_collisions"
+# The problem names the planned joints, the tip and the placement of the base; pairs are
+# checked unless they are disabled, which takes precedence over <enable_collisions>.
+_SRDF_UNUSED = (
+    *("group", "group_state", "end_effector", "virtual_joint", "passive_joint"),
+    *("joint_property", "link_sphere_approximation", "enable_collisions"),
+)
 PAYLOAD = "carried payload"  # name of the link and of its joint
 
 _LOG = logging.getLogger(__name__)
@@ -207,6 +216,7 @@ def with_disabled_pairs(urdf: str, srdf: Path) -> str:
         raise RecipeError(
             [f"{srdf}: is a URDF, expected an SRDF with <{_TAG}> elements"]
         )
+    _account_srdf(tree, srdf)
     entries = [dict(entry.attrib) for entry in tree.iter(_TAG)]
     links = {link.get("name", "") for link in urdf_tree(urdf).iter("link")}
     named = {entry[key] for entry in entries for key in _PAIR if key in entry}
@@ -221,6 +231,29 @@ def with_disabled_pairs(urdf: str, srdf: Path) -> str:
         if not {entry.get(key, "") for key in _PAIR} & set(unknown)
     ]
     return _with_entries(urdf, known, str(srdf))
+
+
+def _account_srdf(tree: Element, srdf: Path) -> None:
+    """Raise RecipeError for elements of an SRDF that are not honoured or unknown, and list those that are not used."""
+    errors, unused = list[str](), set[str]()
+    for element in tree:
+        tag, known = element.tag, (_TAG, *_SRDF_UNUSED)
+        if tag == _NO_DEFAULT:
+            text = "its link would collide with no obstacle: give the pairs of links"
+            errors.append(f"<{tag}> is not supported, since {text} by <{_TAG}>")
+        elif tag not in known and (hint := nearest(tag, known, similarity=MISSPELT)):
+            errors.append(f"unknown element <{tag}>{hint}")
+        elif tag != _TAG:
+            unused.add(tag)
+        for key in element.attrib if tag == _TAG else ():
+            if key not in _PAIR_KEYS:
+                hint = nearest(key, _PAIR_KEYS)
+                errors.append(f"unknown attribute {key!r} of <{tag}>{hint}")
+    if errors:
+        raise RecipeError([f"{srdf}: {text}" for text in dict.fromkeys(errors)])
+    if unused:
+        text = listed([f"<{tag}>" for tag in sorted(unused)])
+        _LOG.info("%s: not used: %s", srdf, text)
 
 
 def with_ignored_pairs(urdf: str, pairs: Iterable[tuple[str, str]]) -> str:

@@ -8,8 +8,8 @@ from xml.etree.ElementTree import Element
 
 import numpy as np
 
-from cnpgen.addons.init.urdf_elements import unread_elements
 from cnpgen.robots.urdf import number_in, numbers_in
+from cnpgen.robots.urdf_elements import unread_elements
 
 MAX_SPEED_RAD_S = 50.0  # of a revolute joint; faster ones are probably in deg/s
 MAX_ANGLE_RAD = 2 * math.pi + 1e-6  # of a roll, pitch or yaw

@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 
 from cnpgen.addons.scene_files.moveit_collisions import (
+    OCTOMAP,
     check_padding,
     is_true,
     read_allowed_collisions,
@@ -173,11 +174,16 @@ def _problem(
     carried = [each for one in own for each in read_attached(one, objects, where)]
     add_object_frames(table, {item.name: item for item, _ in carried})
     names = [each.name for _, each in carried]
-    touching = read_allowed_collisions(scene, objects, names, place)
+    allowed = read_allowed_collisions(scene, objects, names, place)
     check_padding(scene, place)
-    obstacles = list(_obstacles(scene, objects, table, place))
+    obstacles = [
+        each
+        for each in _obstacles(scene, objects, table, place)
+        if each[0] not in allowed.ignored
+    ]
+    touching = tuple(allowed.touching.get(body, ()) for body, *_ in obstacles)
     attached = tuple(
-        placed_attached(item, with_touch_links(each, touching), table, place)
+        placed_attached(item, with_touch_links(each, allowed.touching), table, place)
         for item, each in carried
     )
     problem = _with_goals(request, where, joints, start, table)
@@ -186,7 +192,7 @@ def _problem(
     return replace(
         problem,
         name=name,
-        obstacles=tuple(obstacle for _, obstacle in obstacles),
+        obstacles=tuple(obstacle for *_, obstacle in obstacles),
         source=str(scene_path),
         request=replace(
             problem.request,
@@ -194,7 +200,8 @@ def _problem(
             start_dq=velocity,
             velocity_scale=velocity_scale,
             acceleration_scale=acceleration_scale,
-            obstacle_frames=tuple(frame for frame, _ in obstacles),
+            obstacle_frames=tuple(frame for _, frame, _ in obstacles),
+            obstacle_touch_links=touching if any(touching) else (),
             fixed_frames=tuple(table.used.items()),
             attached=attached,
             constraints=tuple(each for _, each in constraints),
@@ -327,13 +334,14 @@ def _obstacles(
     objects: dict[str, Any],
     table: FrameTable,
     place: str,
-) -> Iterator[tuple[str, Obstacle]]:
-    """Yield the frames and the obstacles of the world."""
+) -> Iterator[tuple[str, str, Obstacle]]:
+    """Yield the names in the allowed collisions, the frames and the obstacles of the world."""
     count = 0
     for item in objects.values():
         frame, pose = table.resolve(item.frame, item.pose)
         for obstacle in built(item.name, item.shapes, pose, place):
             count += 1
-            yield frame, obstacle
+            yield item.name, frame, obstacle
     world = part(scene, "world", dict, place)
-    yield from read_octomap(world, table, MAX_SCENE_OBSTACLES - count, place)
+    for frame, box in read_octomap(world, table, MAX_SCENE_OBSTACLES - count, place):
+        yield OCTOMAP, frame, box

@@ -18,15 +18,15 @@ MIN_SCALE = 1e-3  # of the limits, as in a problem file
 
 @dataclass(frozen=True, eq=False)
 class AttachedObject:
-    """Object that a link of the robot carries.
+    """Object that a link of the robot carries, or a fixed one that some links may touch.
 
     Attributes:
         name: Name of the object.
-        link: Link that carries it.
+        link: Link that carries it; empty for the base of an object of the world.
         shapes: Its shapes.
         frames: Frame of the pose of each shape, a link of the robot at the start state;
             empty for the robot's base.
-        touch_links: Links that may touch it, beside ``link``.
+        touch_links: Links and attached objects that may touch it, beside ``link``.
         mass: Its mass [kg], 0 if it is unknown.
     """
 
@@ -65,6 +65,8 @@ class SceneRequest:
         obstacle_frames: Frame of the pose of each obstacle; empty for obstacles in the
             frame of the robot's base. Other frames are links of the robot at the start
             state.
+        obstacle_touch_links: Links and attached objects that may touch each obstacle;
+            empty if none may touch any.
         fixed_frames: Frames that the file places, and whether each is the base; only
             the root link of the robot may be one of them.
         attached: Objects that the robot carries.
@@ -83,6 +85,7 @@ class SceneRequest:
     goal_frame: str = ""
     other_goal_frames: tuple[str, ...] = ()
     obstacle_frames: tuple[str, ...] = ()
+    obstacle_touch_links: tuple[tuple[str, ...], ...] = ()
     fixed_frames: tuple[tuple[str, bool], ...] = ()
     attached: tuple[AttachedObject, ...] = ()
     constraints: tuple[LinkConstraint, ...] = ()
@@ -96,7 +99,10 @@ class SceneRequest:
     def places(self) -> bool:
         """Whether poses depend on frames of links, or links are named."""
         frames = self.goal_frame, *self.other_goal_frames, *self.obstacle_frames
-        return any((*frames, self.fixed_frames, self.attached, self.constraints))
+        touching = any(self.obstacle_touch_links)
+        return touching or any(
+            (*frames, self.fixed_frames, self.attached, self.constraints)
+        )
 
     @property
     def changes(self) -> tuple[object, ...]:
@@ -138,9 +144,9 @@ class SceneRequest:
             scale = getattr(self, name)
             if not MIN_SCALE <= scale <= 1:
                 yield f"{name} must be between {MIN_SCALE:g} and 1, got {scale:g}"
-        if len(self.obstacle_frames) not in {0, obstacles}:
-            count = len(self.obstacle_frames)
-            yield f"obstacle_frames must have {obstacles} entries, got {count}"
+        for name in ("obstacle_frames", "obstacle_touch_links"):
+            if (count := len(getattr(self, name))) not in {0, obstacles}:
+                yield f"{name} must have {obstacles} entries, got {count}"
 
 
 NO_REQUEST = SceneRequest()

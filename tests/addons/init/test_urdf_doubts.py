@@ -10,12 +10,12 @@ import pytest
 from cnpgen.addons.init.arm import arm_notes, read_arm
 from cnpgen.addons.init.initial_recipes import InitialProblem, problem_of
 from cnpgen.addons.init.joint_limits import read_joint_limits, with_joint_limits
-from cnpgen.addons.init.urdf_elements import unread_elements
 from cnpgen.cli.main import main
 from cnpgen.errors import RecipeError, UsageError
 from cnpgen.problems.load_robot import load_robot
 from cnpgen.robots.robot import Robot
 from cnpgen.robots.urdf import urdf_tree
+from cnpgen.robots.urdf_elements import check_elements, unread_elements
 
 BOX = '<geometry><box size="0.4 0.08 0.08"/></geometry>'
 INERTIA = '<inertia ixx="0.01" ixy="0" ixz="0" iyy="0.06" iyz="0" izz="0.06"/>'
@@ -313,19 +313,58 @@ def test_faults_in_limits_of_moveit_are_named(
 
 def test_what_is_not_read_is_listed(tmp_path: Path) -> None:
     more = "<gazebo/><gazebo><plugin a='1'/></gazebo><sensor name='eye'/><material name='red'/>"
-    limit = LIMIT.replace("effort", "efort") + "<limts/>"
-    shape = SHAPE.replace("collision", "colision") + SHAPE
+    limit = LIMIT.replace("/>", ' gear="3"/>') + "<hardwareInterface/>"
+    shape = SHAPE + "<verbose/>"
     path = write(tmp_path / "arm.urdf", upper=UPPER + shape, limit=limit, more=more)
     notes = list(unread_elements(urdf_tree(path.read_text())))
     assert (
         notes[0]
         == "elements of other software are not read: <gazebo> (2), <sensor> (1)"
     )
-    text = "\n".join(notes[1:])
-    assert "<colision> in <link>" in text
-    assert "'collision'" in text
-    assert "<limts> in <joint>" in text
-    assert "the attribute 'efort' of <limit>" in text
-    assert len(notes) == 4
+    assert notes[1:] == [
+        "<hardwareInterface> in <joint> is not read, 1 time",
+        "<verbose> in <link> is not read, 1 time",
+        "the attribute 'gear' of <limit> is not read, 1 time",
+    ]
+    load_robot(initial(path).problem)
     plain = write(tmp_path / "plain.urdf")
     assert not list(unread_elements(urdf_tree(plain.read_text())))
+
+
+@pytest.mark.parametrize(
+    ("changes", "text"),
+    [
+        (
+            {"upper": UPPER + SHAPE.replace("collision", "colision") + SHAPE},
+            "<colision> in <link> (did you mean 'collision'?)",
+        ),
+        (
+            {"limit": LIMIT.replace("effort", "efort")},
+            "the attribute 'efort' of <limit> (did you mean 'effort'?)",
+        ),
+        (
+            {"limit": LIMIT + "<safety_controler soft_upper_limit='1'/>"},
+            "<safety_controler> in <joint> (did you mean 'safety_controller'?)",
+        ),
+        (
+            {"upper": UPPER.replace("inertial", "inertal") + SHAPE},
+            "<inertal> in <link> (did you mean 'inertial'?)",
+        ),
+        ({"more": "<Link name='x'/>"}, "<Link> (did you mean 'link'?)"),
+    ],
+)
+def test_misspelt_elements_of_a_urdf_are_refused(
+    tmp_path: Path, changes: dict[str, str], text: str
+) -> None:
+    path = write(tmp_path / "a.urdf", **changes)
+    with pytest.raises(RecipeError, match=re.escape(text)):
+        initial(path)
+
+
+def test_a_name_beside_the_one_that_it_resembles_is_not_misspelt() -> None:
+    limit = "<joint><limit velocity='1' gear_velocity='9'/></joint>"
+    check_elements(f"<robot>{limit}</robot>", Path("arm.urdf"))
+    with pytest.raises(RecipeError, match=r"arm.urdf: the attribute 'gear_velocity'"):
+        check_elements(
+            f"<robot>{limit.replace(' velocity', ' v')}</robot>", Path("arm.urdf")
+        )

@@ -451,9 +451,95 @@ def test_allowed_pairs_of_attached_objects_and_links_are_touch_links(tmp_path):
     scene = scene_of(tmp_path, content | {"allowed_collision_matrix": matrix(*allowed)})
     fingers = "panda_leftfinger", "panda_rightfinger"
     assert scene.request.attached[0].touch_links == (*fingers, "panda_link5")
-    for pair in (("post", "panda_link5"), ("stick", "post")):
-        with pytest.raises(SceneError, match=f"is '{' and '.join(sorted(pair))}'"):
-            scene_of(tmp_path, content | {"allowed_collision_matrix": matrix(pair)})
+    allowed = ("post", "panda_link5"), ("stick", "post"), ("panda_link0", "shelf")
+    scene = scene_of(tmp_path, content | {"allowed_collision_matrix": matrix(*allowed)})
+    links = scene.request.obstacle_touch_links
+    touching = dict(zip(("post", "shelf"), links, strict=True))
+    assert touching == {"post": ("panda_link5", "stick"), "shelf": ("panda_link0",)}
+
+
+def test_defaults_of_allowed_collisions(tmp_path, robot):
+    shelf = box("shelf", [0.1, 0.1, 0.1], [0.8, 0, 0.2], "panda_link0")
+    world = {"collision_objects": [*request()["world"]["collision_objects"], shelf]}
+
+    def read(names: list[str], values: list[bool], **entries: Any) -> SceneProblem:
+        defaults = {"default_entry_names": names, "default_entry_values": values}
+        acm = {"allowed_collision_matrix": defaults | entries}
+        return scene_of(tmp_path, request(start_state=stick(), world=world) | acm)
+
+    assert [each.name for each in read(["post"], [True]).obstacles] == ["shelf"]
+    scene = read(["panda_link5"], [True])
+    assert scene.request.obstacle_touch_links == (("panda_link5",),) * 2
+    assert "panda_link5" in scene.request.attached[0].touch_links
+    assert not read(["post"], [False]).request.obstacle_touch_links
+    for names, values, entries, text in (
+        (["stick"], [True], {}, "stick and all others"),
+        (["post", "shelf"], [True, False], {}, "true for post and false for shelf"),
+        (["post"], [True], matrix(), "true for post and false for it and panda_link0"),
+    ):
+        with pytest.raises(SceneError, match=f"matrix is '{text}"):
+            read(names, values, **entries)
+    with pytest.raises(SceneError, match="names the link 'panda_link_5', which the"):
+        placed(read(["panda_link_5"], [True]), robot)
+
+
+def test_an_object_that_links_may_touch_becomes_a_link_of_the_base(tmp_path, robot):
+    pairs = ("post", "panda_link5"), ("shelf", "panda_link0"), ("post", "stick")
+    shelf = box("shelf", [0.1, 0.1, 0.1], [0.8, 0, 0.2], "panda_link0")
+    world = {"collision_objects": [*request()["world"]["collision_objects"], shelf]}
+    content = request(start_state=stick(), world=world)
+    content |= {"allowed_collision_matrix": matrix(*pairs)}
+    scene = placed(scene_of(tmp_path, content), robot)
+    assert [each.name for each in scene.obstacles] == ["shelf"]
+    _, other, _ = requested_problem(robot_problem(), robot, [scene])
+    assert other.shape is not None
+    assert other.shape.joints["attached post"] == 0
+    left_out = {
+        frozenset((each.first, each.second))
+        for each in other.shape.pairs
+        if each.left_out == "disabled"
+    }
+    of_post = {frozenset(("attached post", "panda_link5"))}
+    of_post |= {frozenset(("attached post", "attached stick"))}
+    assert {pair for pair in left_out if "attached post" in pair} == of_post
+    part = next(
+        each for each in other.shape.convex_parts if each.link == "attached post"
+    )
+    corners = [[0.475, -0.025, 0], [0.525, 0.025, 0.3]]
+    np.testing.assert_allclose(
+        [part.vertices.min(axis=0), part.vertices.max(axis=0)], corners, atol=1e-9
+    )
+    with pytest.raises(SceneError, match="attached objects, allowed collisions"):
+        scene_plans(robot_problem(), [scene_of(tmp_path, content)])
+    with pytest.raises(SceneError, match="are not written"):
+        save_scenes(tmp_path / "other", [scene_of(tmp_path, content)])
+
+
+@pytest.mark.slow
+@needs_compiler
+def test_an_allowed_collision_of_an_object_and_links_holds_for_these_links(
+    tmp_path, robot
+):
+    at = pose_of(robot, "panda_hand", START).translation.tolist()
+    block = box("block", [0.1, 0.1, 0.1], at, "panda_link0")
+    hand = ["panda_link6", "panda_link7", "panda_hand"]
+    names = ["block", *hand, "panda_leftfinger", "panda_rightfinger"]
+    world = {"collision_objects": [*request()["world"]["collision_objects"], block]}
+
+    def solved(links: list[str]) -> Any:
+        rows = [[{a, b} - {*links} == {"block"} for b in names] for a in names]
+        acm = {"entry_names": names, "entry_values": rows}
+        content = request(world=world, allowed_collision_matrix=acm)
+        return solve_scenes("panda", [scene_of(tmp_path, content)])
+
+    allowed = solved(names[1:])
+    assert allowed.valid.all()
+    pairs = open_problem(allowed.plans.problem)[1].shape.pairs
+    assert any(each.left_out == "disabled" for each in pairs)
+    refused = solved(hand[:2])
+    assert not refused.valid.any()
+    (failure,) = refused.summary()["not_valid"]
+    assert "panda_hand, attached block" in failure["explanation"]
 
 
 @pytest.mark.slow

@@ -1,13 +1,18 @@
-"""Elements and attributes of a URDF that are not read: those of other software in one line, others one by one."""
+"""Elements and attributes of a URDF that are not read: misspelt ones, others, and those of other software."""
 
 from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterator
+from pathlib import Path
 from xml.etree.ElementTree import Element
 
-from cnpgen.errors import counted, listed, nearest
+from cnpgen.errors import RecipeError, counted, listed, nearest
+from cnpgen.robots.urdf import urdf_tree
+from cnpgen.store.files.accounted import MISSPELT
 
+_TOP = ("link", "joint")
+_REPEATED = {*_TOP, "collision", "visual"}  # of which an element has several
 # tag -> its attributes and children that are read or change nothing (name, color)
 _KNOWN: dict[str, tuple[str, ...]] = {
     "link": ("name", "inertial", "collision", "visual"),
@@ -43,31 +48,48 @@ MAX_LISTED_TAGS = 10
 
 def unread_elements(tree: Element) -> Iterator[str]:
     """Yield sentences about the elements and attributes of a URDF that have no effect."""
-    counts = Counter(
-        each.tag for each in tree if each.tag not in {"link", "joint", *_OPAQUE}
-    )
+    counts = Counter(each.tag for each in tree if each.tag not in {*_TOP, *_OPAQUE})
     if counts:
         texts = [f"<{tag}> ({count})" for tag, count in sorted(counts.items())]
         yield f"elements of other software are not read: {listed(texts, MAX_LISTED_TAGS)}"
-    unknown = Counter[str]()
-    for element in tree:
-        if element.tag in {"link", "joint"}:
-            unknown.update(_unknown(element))
+    unknown = Counter(text for part in tree for text, *_ in _unknown(part))
     for text, count in sorted(unknown.items()):
         yield f"{text} is not read, {counted(count, 'time')}"
 
 
-def _unknown(element: Element) -> Iterator[str]:
-    """Yield the unknown parts of an element and of those in it, with the nearest known name."""
+def check_elements(urdf: str, path: Path) -> None:
+    """Raise RecipeError for parts of a URDF whose names are near one that is read, may occur beside them, and does not."""
+    try:
+        tree = urdf_tree(urdf)
+    except ValueError:
+        # The reader of the robot raises the error.
+        return
+    parts = [(f"<{part.tag}>", part.tag, _TOP) for part in tree if part.tag not in _TOP]
+    parts += [unknown for part in tree for unknown in _unknown(part)]
+    hints = {
+        text: nearest(name.lower(), known, similarity=MISSPELT)
+        for text, name, known in parts
+    }
+    if parts := [f"{text}{hint}" for text, hint in hints.items() if hint]:
+        text = (
+            f"{listed(parts, MAX_LISTED_TAGS)} would not be read: rename or remove it"
+        )
+        raise RecipeError([f"{path}: {text}"])
+
+
+def _unknown(element: Element) -> Iterator[tuple[str, str, tuple[str, ...]]]:
+    """Yield the unknown parts of an element and of those in it: a text, the name, and the names that it may mean."""
     known = _KNOWN.get(element.tag)
     if known is None:
         return
+    present = {*element.attrib, *(child.tag for child in element)} - _REPEATED
+    missing = tuple(name for name in known if name not in present)
     for key in element.attrib:
         # attributes with a name space are those of other software
         if key not in known and not key.startswith("{"):
-            yield f"the attribute {key!r} of <{element.tag}>{nearest(key, known)}"
+            yield f"the attribute {key!r} of <{element.tag}>", key, missing
     for child in element:
         if child.tag not in known and child.tag not in _OPAQUE:
-            yield f"<{child.tag}> in <{element.tag}>{nearest(child.tag, known)}"
+            yield f"<{child.tag}> in <{element.tag}>", child.tag, missing
         else:
             yield from _unknown(child)
