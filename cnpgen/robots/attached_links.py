@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
+from copy import deepcopy
 from typing import TYPE_CHECKING, Any
 from xml.etree import ElementTree
 from xml.etree.ElementTree import Element, SubElement
@@ -13,7 +14,7 @@ from cnpgen.errors import RecipeError
 from cnpgen.robots.obstacle import Obstacle
 from cnpgen.robots.shape.convex_part import turned
 from cnpgen.robots.shape.hull import coal_hull
-from cnpgen.robots.shape.inline import corners_of
+from cnpgen.robots.shape.inline import address_of, corners_of
 from cnpgen.robots.urdf import numbers_text, urdf_tree
 from cnpgen.robots.urdf_changes import with_ignored_pairs
 
@@ -77,6 +78,57 @@ def with_attached_link(
     text = ElementTree.tostring(robot, encoding="unicode")
     links = dict.fromkeys((link, *touch_links))
     return with_ignored_pairs(text, [(each, body) for each in links])
+
+
+def with_padded_link(
+    urdf: str, link: str, scale: float, padding: float, *, obstacles: Sequence[str]
+) -> str:
+    """Return a URDF with an enlarged copy of a link's collision geometry, which other links may touch.
+
+    Args:
+        urdf: Text of the URDF, whose meshes are inline.
+        link: The link.
+        scale: Factor of the sizes of every shape.
+        padding: What these then grow by to all sides [m].
+        obstacles: Fixed links that are obstacles, which the copy must not touch.
+    """
+    robot, body = urdf_tree(urdf), attached_link_name(f"padding of {link}")
+    links = {each.get("name", ""): each for each in robot.findall("link")}
+    copy = Element("link", name=body)
+    copy.extend(deepcopy(links[link].findall("collision")))
+    if not len(copy):
+        return urdf
+    for shape in copy.iterfind("collision/geometry/*"):
+        _enlarge(shape, scale, padding)
+    robot.append(copy)
+    joint = SubElement(robot, "joint", name=body, type="fixed")
+    SubElement(joint, "parent", link=link)
+    SubElement(joint, "child", link=body)
+    text = ElementTree.tostring(robot, encoding="unicode")
+    return with_ignored_pairs(
+        text, [(each, body) for each in links if each not in obstacles]
+    )
+
+
+def _enlarge(shape: Element, scale: float, padding: float) -> None:
+    """Enlarge a geometry, as ``geometric_shapes`` of MoveIt does.
+
+    The corners v of a hull with the mean c become c + (scale + padding / |v - c|) (v - c).
+    """
+    if shape.tag == "mesh":
+        corners = corners_of(shape.get("filename", ""))
+        center = corners.mean(axis=0)
+        offsets = corners - center
+        lengths = np.linalg.norm(offsets, axis=1, keepdims=True)
+        grown = center + (scale + padding / lengths) * offsets
+        shape.set("filename", address_of(grown))
+        return
+    # A capsule is longer by the growth of its radius.
+    sides = {"size": 2, "radius": 1, "length": 0 if shape.tag == "capsule" else 2}
+    for key in sides.keys() & shape.keys():
+        values = (float(value) for value in shape.get(key, "").split())
+        grown_sizes = (scale * value + sides[key] * padding for value in values)
+        shape.set(key, numbers_text(grown_sizes))
 
 
 def uniform_inertia(shapes: Sequence[Obstacle], mass: float) -> pin.Inertia:

@@ -64,7 +64,10 @@ def check_elements(urdf: str, path: Path) -> None:
     except ValueError:
         # The reader of the robot raises the error.
         return
-    parts = [(f"<{part.tag}>", part.tag, _TOP) for part in tree if part.tag not in _TOP]
+    parts = list[tuple[str, str, tuple[str, ...]]]()
+    parts += [
+        (f"<{part.tag}>", part.tag, _TOP) for part in tree if part.tag not in _TOP
+    ]
     parts += [unknown for part in tree for unknown in _unknown(part)]
     hints = {
         text: nearest(name.lower(), known, similarity=MISSPELT)

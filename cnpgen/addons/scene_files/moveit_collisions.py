@@ -10,6 +10,7 @@ from cnpgen.problems.scenes.scene_problem import SceneError
 from cnpgen.problems.scenes.yaml_document import part, scalar
 from cnpgen.store.files.accounted import AccountedMapping, mark_read
 
+MAX_SCALE, MAX_PADDING_M = 10.0, 1.0
 ACM, OCTOMAP = "allowed_collision_matrix", "<octomap>"
 
 
@@ -108,19 +109,24 @@ def _allowed_pairs(matrix: Any, place: str) -> Iterator[frozenset[str]]:
                 yield frozenset({first, second})
 
 
-def check_padding(scene: AccountedMapping, place: str) -> None:
-    """Refuse links with a padding other than 0 or a scale other than 1."""
-    for key, entry_key, neutral in (
-        ("link_padding", "padding", 0.0),
-        ("link_scale", "scale", 1.0),
+def read_link_sizes(
+    scene: AccountedMapping, place: str
+) -> tuple[tuple[str, float, float], ...]:
+    """Return links with their scale and padding [m], other than 1 and 0."""
+    sizes, neutral = dict[str, list[float]](), (1.0, 0.0)
+    for column, (key, name, most) in enumerate(
+        (("link_scale", "scale", MAX_SCALE), ("link_padding", "padding", MAX_PADDING_M))
     ):
+        links = set[str]()
         for entry in part(scene, key, list, place):
             link = part(entry, "link_name", str, place)
-            value = scalar(entry.get(entry_key), f"{place}: {key} of {link!r}")
-            if value != neutral:
-                entry.account.refuse(
-                    key,
-                    value,
-                    f"expected {neutral:g} for the link {link!r}: links keep their"
-                    " sizes, enlarge the objects instead",
-                )
+            value = scalar(entry.get(name), f"{place}: {key} of {link!r}")
+            if link in links:
+                raise SceneError(f"{place}: {key} has the link {link!r} twice")
+            links.add(link)
+            if not neutral[column] <= value <= most:
+                bounds = f"{neutral[column]:g} to {most:g} for the link {link!r}"
+                entry.account.refuse(key, value, f"expected {bounds}, as links grow")
+            elif value != neutral[column]:
+                sizes.setdefault(link, [*neutral])[column] = value
+    return tuple((link, scale, padding) for link, (scale, padding) in sizes.items())

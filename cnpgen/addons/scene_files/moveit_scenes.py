@@ -18,9 +18,9 @@ import numpy as np
 
 from cnpgen.addons.scene_files.moveit_collisions import (
     OCTOMAP,
-    check_padding,
     is_true,
     read_allowed_collisions,
+    read_link_sizes,
 )
 from cnpgen.addons.scene_files.moveit_frames import (
     FrameTable,
@@ -175,7 +175,6 @@ def _problem(
     add_object_frames(table, {item.name: item for item, _ in carried})
     names = [each.name for _, each in carried]
     allowed = read_allowed_collisions(scene, objects, names, place)
-    check_padding(scene, place)
     obstacles = [
         each
         for each in _obstacles(scene, objects, table, place)
@@ -204,6 +203,7 @@ def _problem(
             obstacle_touch_links=touching if any(touching) else (),
             fixed_frames=tuple(table.used.items()),
             attached=attached,
+            link_sizes=read_link_sizes(scene, place),
             constraints=tuple(each for _, each in constraints),
             constraint_frames=tuple(frame for frame, _ in constraints),
         ),

@@ -73,6 +73,8 @@ def placed_scene(scene: SceneProblem, robot: Robot, start: Array) -> SceneProble
         _moved_goal(pose, frame, frames)
         for pose, frame in zip(poses, origins, strict=True)
     )
+    for link, *_ in request.link_sizes:
+        frames.check_link(link, "a padding or scale")
     carried = tuple(_in_link(each, request, frames) for each in request.attached)
     constraints = tuple(_in_world(request, frames))
     plain: SceneRequest = replace(

@@ -19,6 +19,7 @@ from cnpgen.robots.attached_links import (
     attached_link_name,
     root_link,
     with_attached_link,
+    with_padded_link,
 )
 from cnpgen.robots.robot import Robot
 from cnpgen.robots.urdf import urdf_tree
@@ -80,7 +81,7 @@ def requested_problem(
         return problem, robot, list(scenes)
     constraints = *problem.constraint, *first.request.constraints
     changed = _with_scales(problem, robot, first).replaced(constraint=constraints)
-    if first.request.attached:
+    if first.request.attached or first.request.link_sizes:
         objects = [
             _with_mass(item, problem, first, payload) for item in first.request.attached
         ]
@@ -124,6 +125,7 @@ def _without_changes(scene: SceneProblem) -> SceneProblem:
         velocity_scale=NO_REQUEST.velocity_scale,
         acceleration_scale=NO_REQUEST.acceleration_scale,
         attached=(),
+        link_sizes=(),
         constraints=(),
         constraint_frames=(),
     )
@@ -176,7 +178,7 @@ def _with_objects(
     """Return the problem with attached objects as links."""
     if problem.robot.geometry != "urdf":
         raise SceneError(
-            f"{scene.place} has attached objects, and the problem {problem.name!r} has"
+            f"{scene.place} has attached objects or sizes of links, and the problem {problem.name!r} has"
             ' no link geometry: expected [robot] geometry = "urdf"'
         )
     if not all(item.link for item in objects):
@@ -200,9 +202,32 @@ def _with_objects(
             if other in names
         ]
         text = with_ignored_pairs(text, touching) if touching else text
+        text = _with_sizes(text, objects, scene)
     except (RecipeError, ValueError) as error:
         raise SceneError(f"{scene.place}: {error}") from error
     return as_problem(ProblemRecord(record.recipe, text))
+
+
+def _with_sizes(
+    urdf: str, objects: Sequence[AttachedObject], scene: SceneProblem
+) -> str:
+    """Return a URDF with larger copies of links, and of what they carry, that obstacles must not enter."""
+    fixed = [item for item in objects if not item.link]
+    for link, scale, padding in scene.request.link_sizes:
+        bodies = {link: link}
+        bodies |= {
+            item.name: attached_link_name(item.name)
+            for item in objects
+            if item.link == link
+        }
+        for name, body in bodies.items():
+            obstacles = [
+                attached_link_name(item.name)
+                for item in fixed
+                if name not in item.touch_links
+            ]
+            urdf = with_padded_link(urdf, body, scale, padding, obstacles=obstacles)
+    return urdf
 
 
 def _check_clearances(problem: Problem, scene: SceneProblem) -> None:

@@ -224,8 +224,6 @@ OTHER = {  # entry of the tables -> place in the document, and another value
         ("robot_state", "multi_dof_joint_state", "header"),
         header("map"),
     ),
-    "link_padding.link_name": (("link_padding", 0, "link_name"), "finger"),
-    "link_scale.link_name": (("link_scale", 0, "link_name"), "finger"),
     "path_constraints.name": (("path_constraints", "name"), "none"),
     "octomap.octomap.header": (("world", "octomap", "octomap", "header"), header("x")),
     "collision_objects.type": (("world", "collision_objects", 0, "type"), {"key": "c"}),
@@ -327,8 +325,12 @@ def test_the_docs_print_the_tables() -> None:
             [{"name": "x"}],
             "trajectory_constraints is",
         ),
-        (("link_padding", 0, "padding"), 0.02, "link_padding is 0.02: expected 0"),
-        (("link_scale", 0, "scale"), 1.1, "link_scale is 1.1: expected 1"),
+        (
+            ("link_padding", 0, "padding"),
+            -0.02,
+            "link_padding is -0.02: expected 0 to 1 for",
+        ),
+        (("link_scale", 0, "scale"), 0.9, "link_scale is 0.9: expected 1 to"),
         (("is_diff",), True, "is_diff is 'True': the file must have the whole scene"),
         (
             ("allowed_collision_matrix",),

@@ -515,6 +515,79 @@ def test_an_object_that_links_may_touch_becomes_a_link_of_the_base(tmp_path, rob
         save_scenes(tmp_path / "other", [scene_of(tmp_path, content)])
 
 
+def test_padding_and_scale_enlarge_links_for_obstacles_only(tmp_path, robot):
+    sizes = {
+        "link_padding": [{"link_name": "panda_hand", "padding": 0.02}],
+        "link_scale": [
+            {"link_name": "panda_hand", "scale": 1.5},
+            {"link_name": "panda_link0", "scale": 1},
+        ],
+    }
+    content = request(start_state=stick(), **sizes)
+    content |= {"allowed_collision_matrix": matrix(("post", "panda_link5"))}
+    scene = placed(scene_of(tmp_path, content), robot)
+    assert scene.request.link_sizes == (("panda_hand", 1.5, 0.02),)
+    _, other, _ = requested_problem(robot_problem(), robot, [scene])
+    assert other.shape is not None
+    corners = {part.link: part.vertices for part in other.shape.convex_parts}
+    hand = corners["panda_hand"]
+    offsets = hand - hand.mean(axis=0)
+    lengths = np.linalg.norm(offsets, axis=1, keepdims=True)
+    grown = hand.mean(axis=0) + offsets * (1.5 + 0.02 / lengths)
+    name = "attached padding of panda_hand"
+    np.testing.assert_allclose(corners[name], grown, atol=1e-9)
+    assert not {part.link for part in other.shape.convex_parts} & {
+        "attached padding of panda_link0"
+    }
+    (body,) = (each for each in corners if each.endswith("of attached stick"))
+    # In the frame of the joint, which is turned by 45 degrees about z.
+    width = np.sqrt(2) * (1.5 * 0.04 + 0.04)
+    sizes_of_stick = np.ptp(corners[body], axis=0)
+    assert sizes_of_stick == pytest.approx([width, width, 1.5 * 0.3 + 0.04])
+    checked = {
+        frozenset((each.first, each.second))
+        for each in other.shape.pairs
+        if not each.left_out
+    }
+    post = "attached post"  # which no padded link may enter
+    assert {pair for pair in checked if {name, body} & pair} == {
+        frozenset((name, post)),
+        frozenset((body, post)),
+    }
+    sizes = {"link_padding": [{"link_name": "hnd", "padding": 0.02}]}
+    unknown = scene_of(tmp_path, request(**sizes))
+    with pytest.raises(SceneError, match="a padding or scale names the link 'hnd'"):
+        placed(unknown, robot)
+
+
+@pytest.mark.slow
+@needs_compiler
+def test_a_padded_link_keeps_its_distance_from_obstacles(tmp_path, robot):
+    corners = next(
+        part.vertices for part in robot.shape.convex_parts if part.link == "panda_hand"
+    )
+    frame = robot.model.frames[robot.model.getFrameId("panda_hand")]
+    data = robot.model.createData()
+    pin.forwardKinematics(robot.model, data, np.array(START))
+    pose = data.oMi[frame.parentJoint]
+    corners = corners @ pose.rotation.T + pose.translation
+    corner, center = corners[corners[:, 0].argmax()], corners.mean(axis=0)
+    ahead = corner + 0.05 * (corner - center) / np.linalg.norm(corner - center)
+    block = box("block", [0.02] * 3, ahead.tolist(), "world")
+
+    def solved(padding: float) -> Any:
+        pads = [{"link_name": "panda_hand", "padding": padding}]
+        world = {"collision_objects": [block]}
+        content = request(world=world, link_padding=pads)
+        return solve_scenes("panda", [scene_of(tmp_path, content)])
+
+    assert solved(0.03).valid.all()
+    refused = solved(0.06)
+    assert not refused.valid.any()
+    (failure,) = refused.summary()["not_valid"]
+    assert "padding of panda_hand, block" in failure["explanation"]
+
+
 @pytest.mark.slow
 @needs_compiler
 def test_an_allowed_collision_of_an_object_and_links_holds_for_these_links(
