@@ -72,7 +72,7 @@ def requested_problem(
     for scene in scenes:
         if scene.request.changes != first.request.changes:
             raise SceneError(
-                f"{scene.place} has other scaling factors, attached objects, allowed collisions or path"
+                f"{scene.place} has other scaling factors, attached objects, allowed collisions, sizes of links or path"
                 f" constraints than {first.place}, and the plans of one call share a problem: choose the"
                 " scenes of one problem by {first} and {n}",
                 remedies={"first": None, "n": None},
@@ -262,6 +262,6 @@ def refuse_changes(scenes: Sequence[SceneProblem], why: str) -> None:
     for scene in scenes:
         if scene.request.changes_problem:
             raise SceneError(
-                f"{scene.place} has scaling factors, attached objects, allowed collisions or path"
+                f"{scene.place} has scaling factors, attached objects, allowed collisions, sizes of links or path"
                 f" constraints: {why}"
             )
