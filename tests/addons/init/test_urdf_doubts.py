@@ -165,6 +165,14 @@ def test_followers_of_a_locked_joint_have_their_offset(tmp_path: Path) -> None:
             "link upper: <origin rpy> has the angle 90 rad; 90 deg would be 1.571 rad",
         ),
         (
+            {"limit": LIMIT.replace('lower="-2"', "")},
+            "joint j1: its <limit> has no 'lower', which means 0",
+        ),
+        (
+            {"more": finger().replace('<axis xyz="0 0 1"/>', "")},
+            "joint g1: it has no <axis>, so that it moves along or about 1 0 0",
+        ),
+        (
             {"upper": UPPER.replace("0.2 0 0", "1.4 0 0") + SHAPE},
             "link upper: its center of mass is 1.4 m from its origin, the link reaches 0.45 m",
         ),
@@ -285,6 +293,9 @@ def test_limits_of_moveit_replace_those_of_the_urdf(tmp_path: Path) -> None:
     assert robot.acceleration_limit[0] == 3.0
     assert robot.acceleration_limit[1] == usual.acceleration_limit[1]
     assert robot.jerk_limit.tolist() == [300.0, 44.0]
+    notes = "\n".join(arm_notes(arm))
+    assert "j2: max_velocity is not used, since has_velocity_limits is not" in notes
+    assert "limits.yaml: default_velocity_scaling_factor is not used" in notes
 
 
 @pytest.mark.parametrize(
