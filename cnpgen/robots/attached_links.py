@@ -61,9 +61,9 @@ def with_attached_link(
         RecipeError: The URDF has a link or a joint of that name.
     """
     robot, body = urdf_tree(urdf), attached_link_name(name)
+    element = Element("link", name=body)
     if any(part.get("name") == body for part in robot if part.tag in {"link", "joint"}):
         raise RecipeError([f"the URDF has a link or joint {body!r} already"])
-    element = SubElement(robot, "link", name=body)
     if mass:
         element.append(_inertial(uniform_inertia(shapes, mass)))
     for kind in ("visual", "collision"):
@@ -72,12 +72,20 @@ def with_attached_link(
             xyz, rpy = numbers_text(shape.position or ()), numbers_text(shape.rotation)
             SubElement(part, "origin", xyz=xyz, rpy=rpy)
             SubElement(part, "geometry").append(_geometry(shape))
+    return _with_link(robot, element, link, dict.fromkeys((link, *touch_links)))
+
+
+def _with_link(
+    robot: Element, element: Element, parent: str, touching: Iterable[str]
+) -> str:
+    """Return a URDF with a link that is fixed to another one, and that some links may touch."""
+    body = element.get("name", "")
+    robot.append(element)
     joint = SubElement(robot, "joint", name=body, type="fixed")
-    SubElement(joint, "parent", link=link)
+    SubElement(joint, "parent", link=parent)
     SubElement(joint, "child", link=body)
     text = ElementTree.tostring(robot, encoding="unicode")
-    links = dict.fromkeys((link, *touch_links))
-    return with_ignored_pairs(text, [(each, body) for each in links])
+    return with_ignored_pairs(text, [(each, body) for each in touching])
 
 
 def with_padded_link(
@@ -92,21 +100,16 @@ def with_padded_link(
         padding: What these then grow by to all sides [m].
         obstacles: Fixed links that are obstacles, which the copy must not touch.
     """
-    robot, body = urdf_tree(urdf), attached_link_name(f"padding of {link}")
+    robot = urdf_tree(urdf)
     links = {each.get("name", ""): each for each in robot.findall("link")}
-    copy = Element("link", name=body)
+    copy = Element("link", name=attached_link_name(f"padding of {link}"))
     copy.extend(deepcopy(links[link].findall("collision")))
     if not len(copy):
         return urdf
     for shape in copy.iterfind("collision/geometry/*"):
         _enlarge(shape, scale, padding)
-    robot.append(copy)
-    joint = SubElement(robot, "joint", name=body, type="fixed")
-    SubElement(joint, "parent", link=link)
-    SubElement(joint, "child", link=body)
-    text = ElementTree.tostring(robot, encoding="unicode")
-    return with_ignored_pairs(
-        text, [(each, body) for each in links if each not in obstacles]
+    return _with_link(
+        robot, copy, link, [each for each in links if each not in obstacles]
     )
 
 

@@ -12,21 +12,24 @@ from cnpgen.errors import RecipeError, counted, listed, nearest
 from cnpgen.robots.robot_spec import Payload, RobotSpec
 from cnpgen.robots.shape.convex_part import turned
 from cnpgen.robots.urdf import number_in, numbers_in, numbers_text, read_urdf, urdf_tree
+from cnpgen.robots.urdf_elements import check_elements
 from cnpgen.robots.urdf_parameters import placement_of
-from cnpgen.store.files.accounted import MISSPELT
 
 _TURNING, _SLIDING = ("revolute", "continuous"), ("prismatic",)
 # Elements of a joint that moves.
 _MOTION = "axis", "limit", "mimic", "calibration", "dynamics", "safety_controller"
 _TAG, _PAIR = "disable_collisions", ("link1", "link2")
-_PAIR_KEYS = (*_PAIR, "reason")
 _NO_DEFAULT = "disable_default_collisions"
 # The problem names the planned joints, the tip and the placement of the base; pairs are
 # checked unless they are disabled, which takes precedence over <enable_collisions>.
-_SRDF_UNUSED = (
-    *("group", "group_state", "end_effector", "virtual_joint", "passive_joint"),
-    *("joint_property", "link_sphere_approximation", "enable_collisions"),
-)
+_SRDF = {
+    "robot": (
+        *("name", "version", _TAG, _NO_DEFAULT, "group", "group_state"),
+        *("end_effector", "virtual_joint", "passive_joint", "joint_property"),
+        *("link_sphere_approximation", "enable_collisions"),
+    ),
+    _TAG: (*_PAIR, "reason"),
+}
 PAYLOAD = "carried payload"  # name of the link and of its joint
 
 _LOG = logging.getLogger(__name__)
@@ -235,25 +238,12 @@ def with_disabled_pairs(urdf: str, srdf: Path) -> str:
 
 def _account_srdf(tree: Element, srdf: Path) -> None:
     """Raise RecipeError for elements of an SRDF that are not honoured or unknown, and list those that are not used."""
-    errors, unused = list[str](), set[str]()
-    for element in tree:
-        tag, known = element.tag, (_TAG, *_SRDF_UNUSED)
-        if tag == _NO_DEFAULT:
-            text = "its link would collide with no obstacle: give the pairs of links"
-            errors.append(f"<{tag}> is not supported, since {text} by <{_TAG}>")
-        elif tag not in known and (hint := nearest(tag, known, similarity=MISSPELT)):
-            errors.append(f"unknown element <{tag}>{hint}")
-        elif tag != _TAG:
-            unused.add(tag)
-        for key in element.attrib if tag == _TAG else ():
-            if key not in _PAIR_KEYS:
-                hint = nearest(key, _PAIR_KEYS)
-                errors.append(f"unknown attribute {key!r} of <{tag}>{hint}")
-    if errors:
-        raise RecipeError([f"{srdf}: {text}" for text in dict.fromkeys(errors)])
-    if unused:
-        text = listed([f"<{tag}>" for tag in sorted(unused)])
-        _LOG.info("%s: not used: %s", srdf, text)
+    check_elements(tree, srdf, _SRDF)
+    if tree.find(_NO_DEFAULT) is not None:
+        text = f"its link would collide with no obstacle: give pairs by <{_TAG}>"
+        raise RecipeError([f"{srdf}: <{_NO_DEFAULT}> is not supported: {text}"])
+    if unused := sorted({f"<{element.tag}>" for element in tree} - {f"<{_TAG}>"}):
+        _LOG.info("%s: not used: %s", srdf, listed(unused))
 
 
 def with_ignored_pairs(urdf: str, pairs: Iterable[tuple[str, str]]) -> str:

@@ -3,18 +3,19 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from xml.etree.ElementTree import Element
 
 from cnpgen.errors import RecipeError, counted, listed, nearest
-from cnpgen.robots.urdf import urdf_tree
 from cnpgen.store.files.accounted import MISSPELT
 
 _TOP = ("link", "joint")
-_REPEATED = {*_TOP, "collision", "visual"}  # of which an element has several
+# Of which an element has several.
+_REPEATED = {*_TOP, "collision", "visual", "disable_collisions"}
 # tag -> its attributes and children that are read or change nothing (name, color)
 _KNOWN: dict[str, tuple[str, ...]] = {
+    "robot": ("name", "version", *_TOP),
     "link": ("name", "inertial", "collision", "visual"),
     "joint": (
         *("name", "type", "parent", "child", "origin", "axis", "limit", "dynamics"),
@@ -57,32 +58,24 @@ def unread_elements(tree: Element) -> Iterator[str]:
         yield f"{text} is not read, {counted(count, 'time')}"
 
 
-def check_elements(urdf: str, path: Path) -> None:
-    """Raise RecipeError for parts of a URDF whose names are near one that is read, may occur beside them, and does not."""
-    try:
-        tree = urdf_tree(urdf)
-    except ValueError:
-        # The reader of the robot raises the error.
-        return
-    parts = list[tuple[str, str, tuple[str, ...]]]()
-    parts += [
-        (f"<{part.tag}>", part.tag, _TOP) for part in tree if part.tag not in _TOP
-    ]
-    parts += [unknown for part in tree for unknown in _unknown(part)]
+def check_elements(
+    tree: Element, path: Path, known: Mapping[str, tuple[str, ...]] = _KNOWN
+) -> None:
+    """Raise RecipeError for parts of a file whose names are near one that is read, may occur beside them, and does not."""
     hints = {
-        text: nearest(name.lower(), known, similarity=MISSPELT)
-        for text, name, known in parts
+        text: nearest(name.lower(), names, similarity=MISSPELT)
+        for text, name, names in _unknown(tree, known)
     }
     if parts := [f"{text}{hint}" for text, hint in hints.items() if hint]:
-        text = (
-            f"{listed(parts, MAX_LISTED_TAGS)} would not be read: rename or remove it"
-        )
-        raise RecipeError([f"{path}: {text}"])
+        named = listed(parts, MAX_LISTED_TAGS)
+        raise RecipeError([f"{path}: {named} would not be read: rename or remove it"])
 
 
-def _unknown(element: Element) -> Iterator[tuple[str, str, tuple[str, ...]]]:
+def _unknown(
+    element: Element, table: Mapping[str, tuple[str, ...]] = _KNOWN
+) -> Iterator[tuple[str, str, tuple[str, ...]]]:
     """Yield the unknown parts of an element and of those in it: a text, the name, and the names that it may mean."""
-    known = _KNOWN.get(element.tag)
+    known = table.get(element.tag)
     if known is None:
         return
     present = {*element.attrib, *(child.tag for child in element)} - _REPEATED
@@ -95,4 +88,4 @@ def _unknown(element: Element) -> Iterator[tuple[str, str, tuple[str, ...]]]:
         if child.tag not in known and child.tag not in _OPAQUE:
             yield f"<{child.tag}> in <{element.tag}>", child.tag, missing
         else:
-            yield from _unknown(child)
+            yield from _unknown(child, table)

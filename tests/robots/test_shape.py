@@ -507,13 +507,13 @@ def test_links_of_an_srdf_that_the_urdf_lacks_are_a_warning(tmp_path, caplog):
     [
         (
             '<disable_colisions link1="hand" link2="base"/>',
-            r"unknown element <disable_colisions> \(did you mean 'disable_collisions'",
+            r"<disable_colisions> in <robot> \(did you mean 'disable_collisions'",
         ),
         (
             '<disable_collisions link1="hand" link="base"/>',
-            "unknown attribute 'link' of <disable_collisions>",
+            "the attribute 'link' of <disable_collisions>",
         ),
-        ('<disable_default_collisions link="hand"/>', "is not supported, since its"),
+        ('<disable_default_collisions link="hand"/>', "is not supported: its"),
     ],
 )
 def test_elements_of_an_srdf_that_are_not_honoured_are_refused(tmp_path, content, text):

@@ -361,7 +361,7 @@ def test_what_is_not_read_is_listed(tmp_path: Path) -> None:
             {"upper": UPPER.replace("inertial", "inertal") + SHAPE},
             "<inertal> in <link> (did you mean 'inertial'?)",
         ),
-        ({"more": "<Link name='x'/>"}, "<Link> (did you mean 'link'?)"),
+        ({"more": "<Link name='x'/>"}, "<Link> in <robot> (did you mean 'link'?)"),
     ],
 )
 def test_misspelt_elements_of_a_urdf_are_refused(
@@ -374,8 +374,7 @@ def test_misspelt_elements_of_a_urdf_are_refused(
 
 def test_a_name_beside_the_one_that_it_resembles_is_not_misspelt() -> None:
     limit = "<joint><limit velocity='1' gear_velocity='9'/></joint>"
-    check_elements(f"<robot>{limit}</robot>", Path("arm.urdf"))
+    check_elements(urdf_tree(f"<robot>{limit}</robot>"), Path("arm.urdf"))
+    other = limit.replace(" velocity", " v")
     with pytest.raises(RecipeError, match=r"arm.urdf: the attribute 'gear_velocity'"):
-        check_elements(
-            f"<robot>{limit.replace(' velocity', ' v')}</robot>", Path("arm.urdf")
-        )
+        check_elements(urdf_tree(f"<robot>{other}</robot>"), Path("arm.urdf"))

@@ -129,6 +129,8 @@ EQUIVALENT = {  # values that mean the same as those of the documents, or the el
     "rich": {
         "world.collision_objects.operation": "APPEND to a new object adds it",
         "world.octomap.octomap.data": "more cells that are free",
+        "link_padding.link_name": "a padding of 0",
+        "link_scale.link_name": "a scale of 1",
         "start_state.multi_dof_joint_state.transforms.rotation.w": "-q is q",
     },
     "plain": {
