@@ -22,6 +22,8 @@ from cnpgen.problems.scenes.scene_problem import SceneProblem
 from cnpgen.robots.robot import Robot
 from cnpgen.robots.shape.convex_part import turned
 from cnpgen.scenes import SceneError, load_scenes, save_scenes, solve_scenes
+from tests.addons.scene_files.moveit_messages import document
+from tests.addons.scene_files.test_moveit_unused import OTHER, changed
 from tests.conftest import needs_compiler
 from tests.examples.example_robots import needs_robots
 
@@ -31,6 +33,7 @@ JOINTS = [f"panda_joint{index}" for index in range(1, 8)]
 START = [-0.5, -0.4, 0, -2.2, 0, 1.8, 0.785]
 GOAL = [0.5, -0.4, 0, -2.2, 0, 1.8, 0.785]
 UPRIGHT = [0, 0, 0, 1]
+BASE, HAND = "panda_link0", "panda_hand"
 
 
 def box(name: str, size: list[float], at: list[float], frame: str) -> dict[str, Any]:
@@ -715,3 +718,41 @@ def test_plans_record_the_elements_that_were_accepted_as_unused(tmp_path):
         plans.source
         == f"scenes of {tmp_path / 'case.yaml'}, without max_cartesian_speed"
     )
+
+
+def document_for_panda() -> dict[str, Any]:
+    """Return the document of all elements of the messages for a Panda among far objects."""
+    text = json.dumps(document())
+    for old, new in (("hand", HAND), ("finger", "panda_leftfinger"), ("base", BASE)):
+        text = text.replace(f'"{old}"', f'"{new}"')
+    content: dict[str, Any] = json.loads(text)
+    for state in (content["robot_state"], content["start_state"]):
+        state["joint_state"] |= {"name": JOINTS, "position": START, "velocity": []}
+    content["robot_state"].pop("attached_collision_objects")
+    content["world"]["collision_objects"] = content["world"]["collision_objects"][:1]
+    content["fixed_frame_transforms"][0]["transform"]["translation"]["x"] = 3
+    constraints = request()["goal_constraints"][0]["joint_constraints"]
+    content["goal_constraints"][0]["joint_constraints"] = constraints
+    names = content["allowed_collision_matrix"]["entry_names"]
+    assert set(names) <= {HAND, "panda_leftfinger"}
+    return content
+
+
+@pytest.mark.slow
+@needs_compiler
+def test_elements_that_are_not_used_do_not_change_plans_and_verdicts(tmp_path):
+    usual = other = document_for_panda()
+    for place, value in OTHER.values():
+        other = changed(other, place, value)
+    found = []
+    for content in (usual, other):
+        solved = solve_scenes("panda", [scene_of(tmp_path, content)])
+        assert solved.valid.all()
+        plans = solved.plans
+        verdicts = cnpgen.evaluate_plans(plans)
+        points = plans.path_control_points, plans.rate_control_points
+        arrays = *points, plans.columns["obstacle_poses"]
+        bytes_of = [array.tobytes() for array in arrays]
+        report = [verdict.to_dict() for verdict in verdicts.verdicts]
+        found.append((bytes_of, plans.problem, verdicts.summary(), report))
+    assert found[0] == found[1]
