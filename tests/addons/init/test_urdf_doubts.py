@@ -15,7 +15,7 @@ from cnpgen.errors import RecipeError, UsageError
 from cnpgen.problems.load_robot import load_robot
 from cnpgen.robots.robot import Robot
 from cnpgen.robots.urdf import urdf_tree
-from cnpgen.robots.urdf_elements import check_elements, unread_elements
+from cnpgen.robots.urdf_elements import _KNOWN, check_elements, unread_elements
 
 BOX = '<geometry><box size="0.4 0.08 0.08"/></geometry>'
 INERTIA = '<inertia ixx="0.01" ixy="0" ixz="0" iyy="0.06" iyz="0" izz="0.06"/>'
@@ -378,3 +378,30 @@ def test_a_name_beside_the_one_that_it_resembles_is_not_misspelt() -> None:
     other = limit.replace(" velocity", " v")
     with pytest.raises(RecipeError, match=r"arm.urdf: the attribute 'gear_velocity'"):
         check_elements(urdf_tree(f"<robot>{other}</robot>"), Path("arm.urdf"))
+
+
+def chain_to(tag: str) -> list[str]:
+    """Return the tags from the root of a URDF to an element."""
+    parents: dict[str, str] = {}
+    for parent, names in _KNOWN.items():
+        for name in names:
+            parents.setdefault(name, parent)
+    tags = [tag]
+    while tags[0] != "robot":
+        tags.insert(0, parents[tags[0]])
+    return tags
+
+
+@pytest.mark.parametrize("tag", _KNOWN)
+def test_every_misspelt_name_of_a_urdf_is_refused(tag: str) -> None:
+    opening = "".join(f"<{each}>" for each in chain_to(tag))
+    closing = "".join(f"</{each}>" for each in chain_to(tag)[::-1])
+    for name in _KNOWN[tag]:
+        for wrong in (f"{name}q", name.capitalize()[:-1] + name[-1:] * 2):
+            for part in (f"<{wrong}/>", opening.removesuffix(">")):
+                text = f"{opening}{part}{closing}"
+                if part != f"<{wrong}/>":
+                    text = f"{part} {wrong}='1'>{closing}"
+                with pytest.raises(RecipeError, match=f"{wrong}.*did you mean"):
+                    check_elements(urdf_tree(text), Path("arm.urdf"))
+        check_elements(urdf_tree(f"{opening}{closing}"), Path("arm.urdf"))
