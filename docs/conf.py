@@ -56,6 +56,7 @@ extensions = [
 ]
 copybutton_exclude = ".linenos, .gp"
 source_suffix = {".md": "markdown", ".rst": "restructuredtext"}
+myst_enable_extensions = ["attrs_block"]  # a class of a table
 myst_heading_anchors = 4  # the anchors of headings are GitHub's
 smartquotes = False  # they would change --n
 highlight_language = "none"  # blocks without a language
@@ -109,6 +110,7 @@ def toctree(entries: list[str], *options: str) -> str:
 def add_navigation(_: Sphinx, docname: str, source: list[str]) -> None:
     """Append tables of contents to the pages that list others."""
     if docname == root_doc:
+        source[0] = source[0].replace("| your aim |", "{.cards}\n| your aim |")
         lists = source[0].partition("## Tutorials")[
             2
         ]  # the table above it repeats some links
