@@ -67,7 +67,8 @@ def load_trajectories(
     """Load sampled trajectories from a file or a folder; 'cnpgen docs trajectories' lists formats and columns.
 
     Args:
-        path: CSV, JSON, YAML, NPZ, HDF5 or Parquet file, or a folder of them.
+        path: CSV, JSON, YAML, NPZ, HDF5 or Parquet file, bag of ROS, or a folder of
+            files.
         problem: Problem, record, or name or path of a problem, pipeline or dataset.
         joints: Names of the problem's joints in the file, in the problem's order; by
             default the same names. For arrays without names: indices.
@@ -110,7 +111,7 @@ def load_trajectories(
     try:
         tables = [
             part
-            for table in read_trajectory_tables(Path(path), separator=chosen.separator)
+            for table in read_trajectory_tables(Path(path), chosen)
             for part in _separated(table, chosen.separate_by)
         ]
         readers = [
@@ -129,7 +130,9 @@ def load_trajectories(
         reader.check_units(trajectory)
     ignored = dict.fromkeys(name for reader in readers for name in reader.unused())
     if scenes is not None:
-        record, trajectories = with_scenes(record, trajectories, scenes)
+        record, trajectories = with_scenes(
+            record, trajectories, scenes, allow_unused=chosen.allow_unused
+        )
     return LoadedTrajectories(
         record,
         trajectories,

@@ -31,6 +31,8 @@ TRAJECTORY_OPTIONS = (
     "drop_repeats",
     "parameters",
     "scenes",
+    "topic",
+    "allow_unused",
 )
 MAX_IGNORED = 8  # unused columns that are listed
 MAX_NOTES = 5  # that are printed
@@ -85,6 +87,10 @@ def add_trajectory_options(option: Options) -> None:
     add("--parameters", metavar="NAME=V,...", type=values.parameters, help=text)
     text = "obstacles around the trajectories: a file of scenes or of plans; one for each trajectory, or one for all"
     add("--scenes", metavar="FILE", type=recipe_names.present, help=text)
+    text = "topic of a bag of ROS, if several have trajectories"
+    add("--topic", metavar="NAME", help=text)
+    text = "element of a message or scene that may be left unused; may be repeated"
+    add("--allow-unused", metavar="KEY", action="append", help=text)
     text = "body at the tip, in place of the problem's: mass [kg], or mass and centre of mass in the tip frame [m]"
     add("--payload", metavar="M[,X,Y,Z]", type=values.payload, help=text)
 

@@ -37,7 +37,7 @@ from cnpgen.problems.problem_record import (
 from cnpgen.problems.scenes.placement import placed_scene
 from cnpgen.problems.scenes.requested_problem import requested_problem
 from cnpgen.problems.scenes.scene_problem import SceneProblem
-from cnpgen.problems.scenes.scene_reader import read_scenes
+from cnpgen.problems.scenes.scene_reader import ReadingOptions, read_scenes
 from cnpgen.robots.attached_links import attached_link_name
 from cnpgen.robots.obstacle import Obstacle
 from cnpgen.robots.scene import PARKED_POSITION_M
@@ -72,6 +72,8 @@ def with_scenes(
     record: ProblemRecord,
     trajectories: Sequence[Trajectory],
     scenes: str | Path | Sequence[SceneProblem],
+    *,
+    allow_unused: Sequence[str] = (),
 ) -> tuple[ProblemRecord, tuple[Trajectory, ...]]:
     """Place the obstacles of scenes around trajectories: one scene for each, or one for all.
 
@@ -91,7 +93,10 @@ def with_scenes(
     elif file_kind(Path(scenes)) == PLANS:
         placed, poses = _of_plans(problem, Path(scenes))
     else:
-        placed, poses = _of_problems(problem, read_scenes(Path(scenes)))
+        options = ReadingOptions(allow_unused)
+        placed, poses = _of_problems(
+            problem, read_scenes(Path(scenes), options=options)
+        )
     if len(poses) not in {1, len(trajectories)}:
         raise UsageError(
             f"must have one scene, or one for each of {counted(len(trajectories), 'trajectory')}, got {len(poses)}",
