@@ -218,7 +218,7 @@ def summary_text(file: Path, found: "TrajectoryEvaluation") -> str:
         margins.append((name, *margin_cells(entry.to_dict()["margin"], worst)))
     if summary["conditions"]:
         lines += [*table(decided, indent="  ", right=(1, 2, 3, 4, 5)), ""]
-        lines += table(margins, indent="  ", right=(1, 2, 4, 5))
+        lines += table(margins, indent="  ", right=(1, 2, 3, 5, 6))
     lines += [
         "",
         *(
