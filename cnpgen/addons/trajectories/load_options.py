@@ -28,6 +28,8 @@ class LoadOptions:
         drop_repeats: Whether to drop rows that repeat the time and the positions of the
             row before.
         topic: Topic of a bag of ROS, if several have trajectories.
+        extrapolate: Whether parameters may be outside of their ranges. The problem then
+            has wider ranges, and a name that ends with "-extrapolated".
         allow_unused: Keys of messages and scenes that are accepted without effect.
 
     Raises:
@@ -42,6 +44,7 @@ class LoadOptions:
     unwrap: bool = False
     drop_repeats: bool = False
     topic: str | None = None
+    extrapolate: bool = False
     allow_unused: Sequence[str] = ()
 
     def __post_init__(self) -> None:

@@ -22,7 +22,11 @@ from cnpgen.addons.trajectories.trajectory_tables import read_trajectory_tables
 from cnpgen.arrays import Array
 from cnpgen.errors import UsageError, either, nearest
 from cnpgen.problems.problem import Problem
-from cnpgen.problems.problem_record import ProblemRecord, open_problem
+from cnpgen.problems.problem_record import (
+    ProblemRecord,
+    extrapolated_record,
+    open_problem,
+)
 from cnpgen.problems.scenes.scene_problem import SceneProblem
 from cnpgen.robots.parameter_ranges import PARAMETER_UNITS
 from cnpgen.robots.plausible_values import UnitError, find_implausible_value
@@ -105,6 +109,7 @@ def load_trajectories(
         rate=chosen.rate,
         unwrap=chosen.unwrap,
         drop_repeats=chosen.drop_repeats,
+        extrapolate=chosen.extrapolate,
         separated=chosen.separate_by is not None,
         parameters=parameters or {},
     )
@@ -129,6 +134,10 @@ def load_trajectories(
     for reader, trajectory in zip(readers, trajectories, strict=True):
         reader.check_units(trajectory)
     ignored = dict.fromkeys(name for reader in readers for name in reader.unused())
+    if chosen.extrapolate:
+        values = [each.parameters for each in trajectories]
+        stated = [row for row in values if row is not None]
+        record = extrapolated_record(record, np.array(stated)) if stated else record
     if scenes is not None:
         record, trajectories = with_scenes(
             record, trajectories, scenes, allow_unused=chosen.allow_unused

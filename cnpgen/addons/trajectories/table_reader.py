@@ -50,6 +50,7 @@ class ReadOptions:
     rate: float | None = None
     unwrap: bool = False
     drop_repeats: bool = False
+    extrapolate: bool = False
     separated: bool = False  # into parts of a file
     parameters: Mapping[str, float] = field(default_factory=dict)
 
@@ -111,7 +112,7 @@ class TableReader:
         """Return the trajectory of rows with parameters and scene, after a check of its units."""
         parameters, poses = self._parameters(), self._obstacle_poses()
         try:
-            if parameters is not None:
+            if parameters is not None and not self.options.extrapolate:
                 self.record.parameters.checked(parameters)
             trajectory = Trajectory(**rows, parameters=parameters, obstacle_poses=poses)
         except UsageError as error:

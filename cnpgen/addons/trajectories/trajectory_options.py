@@ -139,6 +139,8 @@ def load_file(
 
     given = options_of(arguments, *TRAJECTORY_OPTIONS)
     given = {name: value for name, value in given.items() if value is not None}
+    if getattr(arguments, "extrapolate", False):
+        given["extrapolate"] = True
     names = given.keys() & {entry.name for entry in fields(LoadOptions)}
     reading = LoadOptions(**{name: given.pop(name) for name in names})
     loaded = load_trajectories(arguments.file, problem, options=reading, **given)
