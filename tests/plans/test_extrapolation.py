@@ -42,7 +42,7 @@ def test_the_result_is_marked_and_judged_with_its_values(
 
 def test_without_the_option_values_outside_are_refused() -> None:
     for value in (0.3, 1.3):
-        with pytest.raises(UsageError, match="velocity_factor must be from 0.5 to 1"):
+        with pytest.raises(UsageError, match=r"velocity_factor must be from 0\.5 to 1"):
             cnpgen.complete("airhockey-tables", **TASK, parameters=[[0, 0, 0, value]])
 
 
@@ -74,7 +74,7 @@ def test_files_of_other_programs_need_the_option_at_every_command(
             file[name] = values
         file["path_control_points"] = slow_hit.path_control_points
         file["rate_control_points"] = slow_hit.rate_control_points
-    with pytest.raises(CnpgenError, match="velocity_factor must be from 0.5 to 1"):
+    with pytest.raises(CnpgenError, match=r"velocity_factor must be from 0\.5 to 1"):
         cnpgen.load_plans(path)
     assert cnpgen.load_plans(path, extrapolate=True).problem.name == MARKED
     for words in (
@@ -99,7 +99,7 @@ def test_sampled_trajectories_are_read_with_the_option(
     slow_hit: cnpgen.Plans, tmp_path: Path
 ) -> None:
     cnpgen.export_plans(slow_hit, tmp_path / "csv", to="csv", rate=500)
-    with pytest.raises(UsageError, match="velocity_factor must be from 0.5 to 1"):
+    with pytest.raises(UsageError, match=r"velocity_factor must be from 0\.5 to 1"):
         load_trajectories(tmp_path / "csv", "airhockey-tables")
     options = LoadOptions(extrapolate=True)
     loaded = load_trajectories(tmp_path / "csv", "airhockey-tables", options=options)

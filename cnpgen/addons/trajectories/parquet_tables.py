@@ -64,9 +64,10 @@ def _parquet_metadata(table: Any, key: bytes, path: Path) -> dict[str, Any]:
 def _parquet_units(table: Any, path: Path) -> dict[str, str]:
     """Return the units of columns: those of the table's metadata, or of the metadata of its fields."""
     units = {
-        field.name: (field.metadata or {}).get(name.encode(), b"").decode()
+        field.name: field.metadata[name.encode()].decode()
         for field in table.schema
         for name in UNIT_ATTRIBUTES
+        if name.encode() in (field.metadata or {})
     }
     stated = _parquet_metadata(table, b"units", path)
     # Of several units, one per joint, those of exports are in SI.
