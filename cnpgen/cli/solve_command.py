@@ -78,6 +78,8 @@ def add_options(parser: Parser) -> None:
         type=Path,
         help="output file (default: DIR-plans.h5 or NAME-plans.h5)",
     )
+    text = "time per problem, such as 100ms, after which the first valid plan ends the search; 0: a first plan quickly"
+    option("--time-limit", metavar="SECONDS", type=values.time_limit, help=text)
     option("--allow-large-angles", action="store_true", help=LARGE_ANGLES)
     parser.epilog = f"{parser.epilog or ''}\n"
     add_refine_options(parser)

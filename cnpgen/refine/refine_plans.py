@@ -54,7 +54,7 @@ def solve_plans(
 
     Problems with the column ``goal_option`` are goal states of tasks: rows with the
     same ``sample_id`` belong to one task, and the result has the best valid motion to
-    any of its goal states, one row for each task.
+    any of its goal states, one row for each task; with a time limit, the first valid one.
 
     ``problems`` come from ``draw_boundary_problems`` or ``load_boundary_problems``. The
     other arguments, and the errors, are those of ``refine_plans``.
@@ -74,7 +74,12 @@ def solve_plans(
     )
     if GOAL_OPTION in problems.columns and len(problems):
         return refine_goal_options(
-            without_plans, run, journal=journal, begin=begin, progress=progress
+            without_plans,
+            run,
+            journal=journal,
+            begin=begin,
+            progress=progress,
+            first_valid=options.time_limit is not None,
         )
     return run(without_plans, journal=journal, begin=begin, progress=progress)
 
