@@ -64,24 +64,40 @@ def solve_plans(
         path_control_points=np.full_like(problems.path_control_points, np.nan),
         rate_control_points=np.full_like(problems.rate_control_points, np.nan),
     )
-    run = partial(
-        refine_plans,
+    return refine_tasks(
+        without_plans,
         options=options,
         workers=workers,
         engine=engine,
         address=address,
+        journal=journal,
         discard=discard,
+        begin=begin,
+        progress=progress,
     )
-    if GOAL_OPTION in problems.columns and len(problems):
+
+
+def refine_tasks(
+    plans: Plans,
+    *,
+    options: RefineOptions,
+    journal: str | Path | None,
+    begin: Callable[[int, int], None] | None,
+    progress: Progress | None,
+    **run: Any,
+) -> Refinement:
+    """Refine plans, or plan where control points are nan; goal states of tasks are those of ``solve_plans``."""
+    refine = partial(refine_plans, options=options, **run)
+    if GOAL_OPTION in plans.columns and len(plans):
         return refine_goal_options(
-            without_plans,
-            run,
+            plans,
+            refine,
             journal=journal,
             begin=begin,
             progress=progress,
             first_valid=options.time_limit is not None,
         )
-    return run(without_plans, journal=journal, begin=begin, progress=progress)
+    return refine(plans, journal=journal, begin=begin, progress=progress)
 
 
 @checked_arguments
