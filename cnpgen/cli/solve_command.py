@@ -71,7 +71,9 @@ def add_options(parser: Parser) -> None:
     option("--start", metavar="Q1,Q2,...", type=values.positions, help=text)
     text = "plan file with a plan for each scene, before obstacles or ends moved a little: initial guesses"
     option("--initial-plans", metavar="FILE", type=Path, help=text)
-    text = "end motions in scenes with zero acceleration, so that another one may follow"
+    text = (
+        "end motions in scenes with zero acceleration, so that another one may follow"
+    )
     option("--smooth-stop", action="store_true", default=None, help=text)
     text = "folder with the packages of mesh files of scenes; may be repeated"
     option("--packages", metavar="FOLDER", type=Path, action="append", help=text)
