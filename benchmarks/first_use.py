@@ -104,8 +104,7 @@ def make_inputs(folder: Path) -> None:
         names = "make-dataset airhockey-hit", "plan airhockey-hit"
         cache = folder / "cache-of-inputs"
         for command in (*(COMMANDS[name] for name in names), ARM):
-            command = command.replace("OUT", str(inputs))
-            run(HERE, command, folder, cache)
+            run(HERE, command.replace("OUT", str(inputs)), folder, cache)
 
 
 def main() -> None:
