@@ -22,7 +22,8 @@ WAYS = {"solve": DEFAULT_OPTIONS, "first plan": RefineOptions(time_limit=0)}
 def solve_both(name: str, family: str, count: int, seed: int) -> dict[str, list[Solved]]:  # fmt: skip
     """Solve problems of a family both ways; the first one, which may compile kernels, is not counted."""
     problem, robot, checker = loaded(name)
-    sampler, solved = EndSampler(problem, robot, checker), {way: [] for way in WAYS}
+    sampler = EndSampler(problem, robot, checker)
+    solved: dict[str, list[Solved]] = {way: [] for way in WAYS}
     for number, scene in enumerate(generate(problem, sampler, family, count, seed)):
         for way, refine_options in WAYS.items():
             result = solve_scene(*scene, refine_options)
@@ -69,7 +70,7 @@ def options(parser: argparse.ArgumentParser) -> None:
 def main() -> None:
     """Run the benchmark."""
     chosen = arguments(__doc__, options)
-    results = {}
+    results: dict[str, dict[str, list[Solved]]] = {}
     with np.errstate(all="ignore"):
         for name, family in product(chosen.robots, chosen.families):
             progress(f"{name}: {family}")
