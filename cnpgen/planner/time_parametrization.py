@@ -284,7 +284,7 @@ def make_time_parametrization(
         )
     intervals = INTERVALS_AT_REST if at_rest else PARAMETRIZATION_INTERVALS
     library, speeds = (
-        kernels.load_source(SOURCE),
+        kernels.load_callers(SOURCE),
         make_phase_grid(problem, kernels, intervals),
     )
     if library is not None:

@@ -10,6 +10,7 @@ from threading import get_ident
 import numpy as np
 
 from cnpgen.arrays import Array
+from cnpgen.errors import MachineError
 from cnpgen.kernels.collision.collision_checker import load_collision_library
 from cnpgen.kernels.collision.tree_search import EqualityKernel
 from cnpgen.kernels.library import KernelLibrary, choose_backend, problem_kernels
@@ -30,7 +31,6 @@ from cnpgen.refine.solver.bounds import (
 from cnpgen.refine.solver.compiled_backend import load_step_library
 from cnpgen.refine.solver.grid import make_grid
 from cnpgen.refine.solver.hull_levels import (
-    CompiledHullTranscription,
     HullFeedback,
     HullTranscription,
     can_measure_hulls,
@@ -98,15 +98,19 @@ class Refiner:
         cost_term = choose_cost_term(problem, options.objective, options.weight)
         if kernels is None:
             kernels = problem_kernels(problem, robot, *choose_backend(None))
-        library, world = (
-            load_collision_library(kernels),
-            World(robot, problem.obstacle, problem.object_size),
-        )
-        self.measures_hulls = library is not None and can_measure_hulls(
-            problem, robot, world
-        )
-        self._library, self._hulls, solved = library, dict[int, Hulls](), problem
+        world = World(robot, problem.obstacle, problem.object_size)
+        # The hulls of each thread.
+        self._hulls, solved = dict[int, Hulls](), problem
+        self.measures_hulls = can_measure_hulls(problem, robot, world)
+        if self.measures_hulls or has_clearance_constraints(problem, robot):
+            self._library = load_collision_library(kernels)
+        self.has_hull_rows = kernels.backend == "compiled"
         if self.measures_hulls:
+            if not self.has_hull_rows:
+                raise MachineError(
+                    "distances of links are measured by compiled kernels, which LLVM does not generate here:"
+                    " reinstall llvmlite ('cnpgen docs troubleshooting')"
+                )
             solved = without_distances(problem)
             kernels = problem_kernels(
                 solved, robot, kernels.backend, kernels.cache_folder
@@ -203,10 +207,7 @@ class Refiner:
             settings = replace(settings, max_iterations=0)
         hulls = self.hulls if self.measures_hulls else hulls
         if hulls is not None:
-            kind = (
-                CompiledHullTranscription if self.measures_hulls else HullTranscription
-            )
-            motion = kind(motion, hulls, task.scene.poses[0])
+            motion = HullTranscription(motion, hulls, task.scene.poses[0])
             more: Array | float = 0.0 if extra is None else extra
             if self.measures_hulls:
                 more = more - accepted_along(

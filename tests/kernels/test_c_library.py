@@ -18,6 +18,7 @@ from cnpgen.kernels.c_library import (
     source_text,
 )
 from cnpgen.kernels.compiler import find_compiler
+from cnpgen.kernels.library import KernelLibrary
 from cnpgen.store.files.cache_folder import exclusive_lock, make_private_folder
 from tests.conftest import HANGING, needs_compiler
 from tests.machine.test_workers import alive
@@ -114,9 +115,12 @@ def test_a_broken_compiler_is_an_error_or_a_warning_and_no_library(
     monkeypatch.setattr(compiler, "find_spec", lambda _: None)  # no ziglang
     with pytest.raises(MachineError, match=text):
         compile_source([source], tmp_path)
-    with pytest.warns(RuntimeWarning, match=f"{text}.*answer runs in NumPy"):
-        assert load_library((source,), tmp_path) is None
-    assert load_library((source,), tmp_path) is None  # without another warning
+    with pytest.raises(MachineError, match=f"answer is missing: .*{text}"):
+        load_library((source,), tmp_path)
+    kernels = KernelLibrary("compiled", tmp_path, "")
+    with pytest.warns(RuntimeWarning, match=f"{text}.*NumPy runs in its place"):
+        assert kernels.load_callers(source) is None
+    assert KernelLibrary("numpy", tmp_path, "").load_callers(source) is None
 
 
 @pytest.mark.skipif(not Path("/proc/self").exists(), reason="needs /proc")

@@ -131,7 +131,7 @@ class _Motion(ctypes.Structure):
 
 def load_step_library(kernels: KernelLibrary) -> ctypes.CDLL | None:
     """Return the library of step.c, or None where kernels are not compiled."""
-    library = kernels.load_source(*SOURCES)
+    library = kernels.load_callers(*SOURCES)
     if library is not None:
         library.evaluate.argtypes, library.evaluate.restype = (c_void_p,) * 3, c_double
         build = (*(c_void_p,) * 3, *(c_double,) * 4, *(c_void_p,) * 3)
