@@ -299,9 +299,7 @@ def around_obstacles(
 def _on_hulls(
     refiner: Refiner, task: RefinementTask, guess: Attempt
 ) -> Iterator[Attempt]:
-    """Yield attempts on hulls in place of capsules, if kernels are compiled: on the coarse and on the strict level."""
-    if not refiner.has_hull_rows:
-        return
+    """Yield attempts on hulls in place of capsules: on the coarse and on the strict level."""
     coarse = refiner.solve(
         task, refiner.levels.warm, guess.variables, Outcome.RESTARTED, refiner.hulls
     )

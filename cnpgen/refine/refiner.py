@@ -10,7 +10,6 @@ from threading import get_ident
 import numpy as np
 
 from cnpgen.arrays import Array
-from cnpgen.errors import MachineError
 from cnpgen.kernels.collision.collision_checker import load_collision_library
 from cnpgen.kernels.collision.tree_search import EqualityKernel
 from cnpgen.kernels.library import KernelLibrary, choose_backend, problem_kernels
@@ -104,13 +103,7 @@ class Refiner:
         self.measures_hulls = can_measure_hulls(problem, robot, world)
         if self.measures_hulls or has_clearance_constraints(problem, robot):
             self._library = load_collision_library(kernels)
-        self.has_hull_rows = kernels.backend == "compiled"
         if self.measures_hulls:
-            if not self.has_hull_rows:
-                raise MachineError(
-                    "distances of links are measured by compiled kernels, which LLVM does not generate here:"
-                    " reinstall llvmlite ('cnpgen docs troubleshooting')"
-                )
             solved = without_distances(problem)
             kernels = problem_kernels(
                 solved, robot, kernels.backend, kernels.cache_folder

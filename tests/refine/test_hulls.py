@@ -8,6 +8,7 @@ import pytest
 import scipy
 
 from cnpgen.kernels.collision.tree_search import TreeSettings
+from cnpgen.kernels.library import choose_backend, problem_kernels
 from cnpgen.problems.constraints.clearance import RobotClearance
 from cnpgen.problems.load_robot import load_robot
 from cnpgen.problems.problem_file import load_problem
@@ -253,6 +254,24 @@ def test_an_end_within_the_tolerance_of_a_contact_is_accepted(tmp_path):
     assert found.iterations < 60
     accepted = tool.hulls.accepted_at(np.array([task.boundary.start_q[0]]).T, poses)
     assert accepted.max() == pytest.approx(0.003, abs=1e-6)
+
+
+@needs_compiler
+def test_rows_of_distances_follow_those_of_interpreted_kernels(tmp_path):
+    problem = load_problem(write_problem(tmp_path, obstacles=KINDS))
+    robot, poses = load_robot(problem), place_obstacles(problem.obstacle)
+    numpy = problem_kernels(problem, robot, *choose_backend("numpy"))
+    tools = Refiner(problem, robot), Refiner(problem, robot, kernels=numpy)
+    random = np.random.default_rng(2)
+    w = random.uniform(0.1, 1.0, (tools[0].residual_kernels.values.tape.inputs[0], 30))
+    compiled, interpreted = (
+        tool.hulls.row_kernels(tool.residual_kernels, poses).jacobian(
+            w, np.zeros((0, 30))
+        )
+        for tool in tools
+    )
+    for found, expected in zip(interpreted, compiled, strict=True):
+        np.testing.assert_allclose(found, expected, rtol=1e-9, atol=1e-9)
 
 
 @needs_compiler

@@ -85,7 +85,7 @@ def without_contacts(problem: Problem) -> Problem:
 
 
 class HullTranscription(Transcription):
-    """A motion with the clearances of the links' hulls as further residuals, of compiled kernels.
+    """A motion with the clearances of the links' hulls as further residuals.
 
     The hulls are among obstacles with ``obstacle_poses``, shape (width,), all of those
     of the scene.

@@ -217,7 +217,7 @@ class Hulls:
     def row_kernels(
         self, kernels: ResidualKernels, obstacle_poses: Array
     ) -> RowKernels:
-        """Return kernels whose rows end with the distances of ``measure``; compiled kernels are required."""
+        """Return kernels whose rows end with the distances of ``measure``."""
         checker, columns = self.placed_checker(obstacle_poses), self._columns
         if self._row_kernels is None or self._row_kernels[0] is not kernels.values:
             self._row_kernels = (
