@@ -91,10 +91,6 @@ def pytest_configure(config: pytest.Config) -> None:
         signal.getsignal(signal.SIGINT) is signal.SIG_IGN
     ):  # as shells start what runs in the background
         signal.signal(signal.SIGINT, signal.default_int_handler)
-    if find_compiler() is None:
-        config.addinivalue_line(
-            "filterwarnings", "ignore:.*NumPy runs in its place:RuntimeWarning"
-        )
 
 
 @pytest.hookimpl(tryfirst=True)

@@ -108,21 +108,6 @@ class KernelLibrary:
         """Return the library of C source that follows ``arrays.h``, see ``load_library``."""
         return load_library((ARRAYS, *paths), self.cache_folder)
 
-    def load_callers(self, *paths: Path) -> ctypes.CDLL | None:
-        """Return the library of C source that calls kernels, for which there is NumPy code, too.
-
-        None if the backend is not "compiled", or, after a warning, if the library cannot
-        be loaded.
-        """
-        if self.backend != "compiled":
-            return None
-        try:
-            return self.load_source(*paths)
-        except MachineError as error:
-            text = f"{error}; NumPy runs in its place, which is slower"
-            warnings.warn(text, RuntimeWarning, stacklevel=3)
-            return None
-
     def tape(self, builder: Callable[..., Any], **parameters: Any) -> Tape:
         """Return the tape of an SX function without compiling it; see ``load``."""
         return self._tape(builder, parameters)

@@ -115,12 +115,12 @@ class Refiner:
             self.spec,
             kernels.load_by_structure(stage_values),
             kernels.load_by_structure(stage_jacobian),
+            load_step_library(kernels),
             cost_term,
             None
             if cost_term is None
             else kernels.load_by_structure(cost_term_residuals, terms=cost_term.tables),
             () if cost_term is None else residual_counts(robot, cost_term),
-            load_step_library(kernels),
         )
         self.levels = (
             default_grid_levels(problem, self.settings) if levels is None else levels

@@ -269,8 +269,7 @@ def _check_handwritten(findings: _Findings) -> tuple[str, str]:
         compiler = ""
         if not built:
             findings.notes.append(
-                f"{error}; without compiled C code there are no time-parametrized plans, observations of scenes and"
-                " distances of hulls, and refining is slower"
+                f"{error}; without compiled C code planners, the refiner, scenes and observations do not work"
             )
     if built:
         return f"compiled with the package for {built}", compiler
