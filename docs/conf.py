@@ -24,9 +24,13 @@ sys.path[:0] = [
 ]  # the package of this checkout; the scripts beside this file
 
 from gallery import CARDS, available, write_gallery  # noqa: E402
-from generate import BRIDGES, bridge_names, public_objects  # noqa: E402
 from notebooks import write_notebooks  # noqa: E402
 
+from cnpgen.addons.manual.name_page import (  # noqa: E402
+    BRIDGES,
+    bridge_names,
+    public_objects,
+)
 from cnpgen.cli.docs_command import list_pages, page_text  # noqa: E402
 from cnpgen.machine.versions import DOCUMENTATION_URL, __version__  # noqa: E402
 
@@ -81,7 +85,7 @@ CAPTIONS = {
     "reference": "Reference",
     "benchmarks": "Benchmarks",
 }
-MADE = "cli", "keys"  # pages of the reference without a file in the repository
+MADE = "api", "cli", "keys"  # pages of the reference without a file in the repository
 OTHERS = (
     "README",
     "CHANGELOG",
