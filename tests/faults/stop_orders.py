@@ -96,7 +96,6 @@ def run_orders(
     *,
     seed: int = 0,
     first: int = 0,
-    progress: Callable[[int], None] | None = None,
 ) -> StopOutcome:
     """Run random orders of requests.
 
@@ -104,7 +103,6 @@ def run_orders(
         count: Number of orders.
         seed: Seed of all choices.
         first: Number of the first order.
-        progress: Called after every order with the number of orders so far.
     """
     outcome = StopOutcome()
     planner, plans = valid_plans(PROBLEM)
@@ -115,8 +113,6 @@ def run_orders(
             text = " ".join(str(error).split())[:300]
             outcome.findings.append(f"seed {seed}, order {number}: {text}")
             print(outcome.findings[-1], file=sys.stderr, flush=True)
-        if progress is not None:
-            progress(number + 1 - first)
     return outcome
 
 
