@@ -13,6 +13,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from tests.faults.call_fuzz import fuzz_calls
+from tests.faults.chunk_orders import run_chunk_orders
 from tests.faults.flips import flip_bits
 from tests.faults.fuzz import fuzz
 from tests.faults.kills import kill
@@ -50,8 +51,13 @@ def flips(count: int, seed: int, first: int, _kinds: tuple[str, ...]) -> Part:
 
 
 def stops(count: int, seed: int, first: int, _kinds: tuple[str, ...]) -> Part:
-    """Run random orders of requests to a runtime."""
-    return _of_stops(run_orders(count, seed=seed, first=first), count, first)
+    """Run random orders of requests to a runtime, and as many to an executor of chunks."""
+    plans = count - count // 2
+    outcome = run_orders(plans, seed=seed, first=first)
+    chunks = run_chunk_orders(count // 2, seed=seed, first=first)
+    outcome.requests.update(chunks.requests)
+    outcome.findings += chunks.findings
+    return _of_stops(outcome, count, first)
 
 
 def moments(count: int, seed: int, first: int, _kinds: tuple[str, ...]) -> Part:

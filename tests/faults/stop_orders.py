@@ -34,6 +34,7 @@ MODELS = ("heavy-object", "panda-cup", "panda-scenes", "ur5-wipe")  # of single 
 N_PLANS = 12
 TICK_S = 2.5e-4  # the jerk jumps at the begin of a stop, within a step of integration
 TORQUE_STRIDE = 40  # ticks between checked torques
+KEPT_STOPS_SHARE = 0.2  # of runtimes that compute stops before they are needed
 MAX_DELAY_S = 0.01  # of the start of a request, and of planning
 MAX_WAIT_S = 120.0  # for a thread; a longer one hangs
 REFUSED = (  # what a request of a random order may be told
@@ -126,7 +127,10 @@ class _Order:
         self._there = plans[self._random.integers(len(plans))]
         start = self._there.boundary.start_q[0]
         self._planner, self._requests = planner, requests
-        self._runtime = PlanRuntime(planner, start, history=1e3, max_step=9.0)
+        keep_stops = self._random.random() < KEPT_STOPS_SHARE  # they take most time
+        self._runtime = PlanRuntime(
+            planner, start, history=1e3, max_step=9.0, keep_stops=keep_stops
+        )
         self._served: list[tuple[float, SetPoint]] = []
         self._errors: list[str] = []
 

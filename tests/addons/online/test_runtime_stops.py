@@ -21,6 +21,7 @@ from cnpgen.problems.problem_record import open_problem
 from cnpgen.refine.refine_plans import solve_plans
 from tests.conftest import some
 from tests.examples.example_robots import needs_robots
+from tests.faults.chunk_orders import run_chunk_orders
 from tests.faults.stop_orders import check_states, run_orders, valid_plans
 
 TARGET = [2.49, 0.0]  # m
@@ -349,6 +350,12 @@ def test_nothing_changes_after_a_stop_in_any_order_of_requests():
     outcome = run_orders(5, seed=2026)
     assert outcome.findings == []
     assert outcome.requests["stop, ACCEPTED"] >= 2
+
+
+def test_no_chunk_changes_a_motion_after_a_stop_in_any_order_of_requests():
+    outcome = run_chunk_orders(5, seed=2026)
+    assert outcome.findings == []
+    assert outcome.requests["chunk, STOPPED"] >= 2
 
 
 def test_a_stop_that_is_being_computed_is_finished_before_the_runtime_resumes(
