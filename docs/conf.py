@@ -24,10 +24,14 @@ sys.path[:0] = [
 ]  # the package of this checkout; the scripts beside this file
 
 from gallery import CARDS, available, write_gallery  # noqa: E402
-from generate import BRIDGES, bridge_names, public_objects  # noqa: E402
 from notebooks import write_notebooks  # noqa: E402
 from planner_pages import write_pages  # noqa: E402
 
+from cnpgen.addons.manual.name_page import (  # noqa: E402
+    BRIDGES,
+    bridge_names,
+    public_objects,
+)
 from cnpgen.cli.docs_command import list_pages, page_text  # noqa: E402
 from cnpgen.machine.versions import DOCUMENTATION_URL, __version__  # noqa: E402
 
@@ -53,6 +57,7 @@ extensions = [
 ]
 copybutton_exclude = ".linenos, .gp"
 source_suffix = {".md": "markdown", ".rst": "restructuredtext"}
+myst_enable_extensions = ["attrs_block"]  # a class of a table
 myst_heading_anchors = 4  # the anchors of headings are GitHub's
 smartquotes = False  # they would change --n
 highlight_language = "none"  # blocks without a language
@@ -82,7 +87,7 @@ CAPTIONS = {
     "reference": "Reference",
     "benchmarks": "Benchmarks",
 }
-MADE = "cli", "keys"  # pages of the reference without a file in the repository
+MADE = "api", "cli", "keys"  # pages of the reference without a file in the repository
 OTHERS = (
     "README",
     "CHANGELOG",
@@ -106,6 +111,7 @@ def toctree(entries: list[str], *options: str) -> str:
 def add_navigation(_: Sphinx, docname: str, source: list[str]) -> None:
     """Append tables of contents to the pages that list others."""
     if docname == root_doc:
+        source[0] = source[0].replace("| your aim |", "{.cards}\n| your aim |")
         lists = source[0].partition("## Tutorials")[
             2
         ]  # the table above it repeats some links

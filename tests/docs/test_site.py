@@ -16,6 +16,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from cnpgen.addons.manual.name_page import name_page
 from cnpgen.cli.docs_command import list_pages, page_url
 from cnpgen.machine import versions
 from tests.conftest import HANGING
@@ -106,7 +107,7 @@ def test_every_tutorial_links_to_its_notebook(site: Path) -> None:
 def test_every_public_name_has_a_page_with_its_signature(site: Path) -> None:
     names = re.findall(
         r"^\| `(\w+)` \|",
-        (ROOT / "docs" / "reference" / "api.md").read_text(encoding="utf-8"),
+        name_page(),
         re.M,
     )
     pages = {
