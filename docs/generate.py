@@ -30,6 +30,7 @@ MODULES = (
 BRIDGES = (
     "torch",
     "jax",
+    "lerobot",
 )  # their modules are read without an import of the framework
 
 NAMES_INTRODUCTION = """\

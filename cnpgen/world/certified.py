@@ -96,7 +96,7 @@ class ConvexBody:
         apart = np.linalg.norm(self.corners - self.corners[heights.argmin()], axis=1)
         # The factor covers rounding.
         reach = 1.001 * np.sqrt(0.5) / CELLS * apart
-        return self.corners[heights - heights.min() <= reach]
+        return np.asarray(self.corners[heights - heights.min() <= reach])
 
 
 def lowest_products(corners: Array, directions: Array) -> Array:

@@ -37,6 +37,7 @@ __all__ = ["ChunkStep"]
 
 STATE = "observation.state"
 RADIANS = {"rad": 1.0, "deg": float(np.pi / 180)}
+CLOCK_STEP_S = 1e-6
 PLACE = (
     "policies without real-time chunking (select_action) and the asynchronous server"
     " (PolicyServer._predict_action_chunk, its loop over steps) postprocess single"
@@ -162,7 +163,8 @@ class ChunkStep(ProcessorStep):  # type: ignore[misc] # LeRobot has no types
     def _begin(self, q: Array, now: float) -> None:
         """Reset the executor to an arm at rest; a motion that still runs is an error."""
         if self._read is not None:
-            self._advance(now)
+            # The observation is the first one after the reset, and not as old as it.
+            self._advance(max(now - CLOCK_STEP_S, self._read))
             if self._executor.stopped is None:
                 self._executor.stop()
         self._executor.reset((q, np.zeros_like(q)))

@@ -88,7 +88,8 @@ class ChunkChecks:
                 f"has {values.shape[1]} columns, earlier ones have {self._columns}",
                 argument="chunk",
             )
-        return values[:, :n], values[:, n:]
+        # The other columns are kept, and the caller may reuse the array.
+        return values[:, :n], values[:, n:].copy()
 
     def keep_columns(self, columns: int) -> None:
         """Demand a number of columns of all later chunks."""
