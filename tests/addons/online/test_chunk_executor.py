@@ -512,7 +512,9 @@ def test_times_to_rest_that_disable_the_check_are_refused(wrong):
         ChunkExecutor("panda-3kg", **OPTIONS, options=ChunkOptions(stop_after=wrong))
 
 
-def test_future_set_points_are_those_that_are_served_later(controller):
+def test_future_set_points_are_those_that_are_served_later():
+    # The join is at none of the times.
+    controller = Controller(ChunkExecutor("panda-3kg", **OPTIONS | {"join": 0.055}))
     values = chunk(0.0)
     assert controller.step(values).accepted
     values[:] = np.nan  # the caller may reuse the array
