@@ -355,3 +355,16 @@ def test_healthy_recordings_of_a_simulated_arm_are_never_excluded(
     code, found = check(capsys, folder, "--unit", "rad")
     assert code == 0, found
     assert found["counts"]["EXCLUDE"] == 0
+
+
+@pytest.mark.parametrize(
+    "name",
+    ["panda", "fr3", "ur3e", "ur5e", "ur10e", "ur16e", "ur20", "xarm6", "xarm7"]
+    + ["iiwa7", "iiwa14", "kinova_gen3", "viperx", "so100_follower", "so101"],
+)
+def test_all_common_arms_are_known_and_limit_velocities(name: str) -> None:
+    arm = find_arm(name)
+    limit = arm.limits["velocity"]
+    # Outside, a unit was mistaken.
+    assert (limit.upper > 1.2).all()
+    assert (limit.upper < 7).all()
