@@ -23,7 +23,7 @@ MODULES = (
     "errors",
 )
 # Their modules are read without an import of the framework.
-BRIDGES = ("torch", "jax")
+BRIDGES = ("torch", "jax", "lerobot")
 
 _INTRODUCTION = """\
 # Python interface
