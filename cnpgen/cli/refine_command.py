@@ -151,6 +151,8 @@ def refine_and_save(
     from cnpgen.refine.refine_plans import identity_of_run, refine_plans
 
     given = options_of(arguments, *REFINING)
+    # Of ``solve`` only.
+    given["time_limit"] = getattr(arguments, "time_limit", None)
     options = RefineOptions(
         **{name: value for name, value in given.items() if value is not None}
     )

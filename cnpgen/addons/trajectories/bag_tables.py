@@ -37,7 +37,7 @@ MESSAGE_TYPES = (
     "FollowJointTrajectory_SendGoal_Request",
 )
 MAX_MESSAGES = 1_000_000  # of a topic
-MAX_LISTED = 8  # topics in messages
+MAX_TOPICS = 8  # topics in messages
 
 
 def is_bag_folder(path: Path) -> bool:
@@ -104,19 +104,19 @@ def _topic(path: Path, bag: Any, stated: str | None) -> str:
     if stated is not None and stated not in known:
         raise UsageError(
             f"{path} has no trajectories in the topic {stated!r}, only in"
-            f" {listed(list(known), MAX_LISTED) or 'none'}{nearest(stated, known)}",
+            f" {listed(list(known), MAX_TOPICS) or 'none'}{nearest(stated, known)}",
             argument="topic",
         )
     if not known:
         topics = sorted({f"{each.topic} ({each.msgtype})" for each in bag.connections})
         raise UsageError(
-            f"{path} has no trajectories, only {listed(topics, MAX_LISTED) or 'no messages'};"
+            f"{path} has no trajectories, only {listed(topics, MAX_TOPICS) or 'no messages'};"
             f" expected messages of type {either(MESSAGE_TYPES)}"
         )
     if stated is None and len(known) > 1:
         texts = [f"{topic} ({kind})" for topic, kind in sorted(known.items())]
         raise UsageError(
-            f"{path} has several topics with trajectories, {listed(texts, MAX_LISTED)}: {{topic}} names one",
+            f"{path} has several topics with trajectories, {listed(texts, MAX_TOPICS)}: {{topic}} names one",
             remedies={"topic": min(known)},
         )
     return stated or next(iter(known))

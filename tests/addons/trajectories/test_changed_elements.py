@@ -55,7 +55,7 @@ STATES = [
 COLUMNS = {"t": T.tolist(), "q": Q.tolist(), "joint_names": JOINTS}
 
 
-def fate(unchanged: Path, changed: Path) -> str:
+def outcome(unchanged: Path, changed: Path) -> str:
     """Return how a changed file is read: "refused", "listed", "changed", or "silent"."""
     before = load_trajectories(unchanged, "airhockey")
     try:
@@ -159,7 +159,7 @@ def test_elements_of_messages(
     paths = tmp_path / "a.json", tmp_path / "b.json"
     for path, content in zip(paths, (document, changed), strict=True):
         path.write_text(json.dumps(content))
-    assert fate(*paths) == expected
+    assert outcome(*paths) == expected
 
 
 def test_the_loss_of_an_element_is_accepted_by_name(tmp_path: Path) -> None:
@@ -189,7 +189,7 @@ def test_names_of_columns(tmp_path: Path, old: str, new: str, expected: str) -> 
     for path, name in zip(paths, (old, new), strict=True):
         head = ",".join(name if each == old else each for each in HEAD)
         np.savetxt(path, rows, "%.17g", ",", header=head, comments="")
-    assert fate(*paths) == expected
+    assert outcome(*paths) == expected
 
 
 @pytest.mark.parametrize(
@@ -214,7 +214,7 @@ def test_elements_of_hdf5(
             file["t"], file["q"] = T, Q
             if path is paths[1]:
                 change(file)
-    assert fate(*paths) == expected
+    assert outcome(*paths) == expected
 
 
 def test_units_in_the_metadata_of_parquet(tmp_path: Path) -> None:
@@ -234,7 +234,7 @@ def test_units_in_the_metadata_of_parquet(tmp_path: Path) -> None:
     for table, expected in ((in_fields, "changed"), (in_table, "changed")):
         parquet.write_table(plain, tmp_path / "a.parquet")
         parquet.write_table(table, tmp_path / "b.parquet")
-        assert fate(tmp_path / "a.parquet", tmp_path / "b.parquet") == expected
+        assert outcome(tmp_path / "a.parquet", tmp_path / "b.parquet") == expected
 
 
 def test_positions_of_joints_that_are_not_planned(tmp_path: Path) -> None:
@@ -244,7 +244,7 @@ def test_positions_of_joints_that_are_not_planned(tmp_path: Path) -> None:
         held["held_joint_positions"] = np.array([position])
         np.savez(tmp_path / "a.npz", t=T, q=Q)
         np.savez(tmp_path / "b.npz", t=T, q=Q, **held)
-        assert fate(tmp_path / "a.npz", tmp_path / "b.npz") == expected
+        assert outcome(tmp_path / "a.npz", tmp_path / "b.npz") == expected
     folder = tmp_path / "plans"
     folder.mkdir()
     rows = np.column_stack([T, Q])
