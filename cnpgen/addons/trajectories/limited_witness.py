@@ -27,8 +27,8 @@ POINTS_PER_INTERVAL = 8  # of knots, at which the limits hold
 MAX_WINDOWS = 12  # of a joint
 MAX_SIZE = 3  # of a window, in multiples of the numbers of spans
 PROGRAM_TOLERANCE = 1e-9
-REGULARIZATION = 1e-9  # of the curvature of the quadratic program
-LIMIT_SHARE = 1 - 1e-4  # of the limit, in the program: it holds at points
+SPLINE_REGULARIZATION = 1e-9  # of the curvature of the quadratic program
+PROGRAM_LIMIT_SHARE = 1 - 1e-4  # of the limit, in the program: it holds at points
 ERROR_SHARE = 0.999  # of the errors, for the rounding of the program
 
 
@@ -122,7 +122,7 @@ def _limited(
             window = _around(t, sample, size * WINDOW_SPANS)
             chosen = np.isin(t, window)
             part = _Part(spline, window, [values[chosen] for values in data])
-            found = part.smoothest(allowed, LIMIT_SHARE * limit)
+            found = part.smoothest(allowed, PROGRAM_LIMIT_SHARE * limit)
             if found is not None:
                 break
         if found is None:
@@ -176,7 +176,7 @@ class _Part:
         rows, lower, upper = self._constraints(allowed, limit, unit)
         scale = float(np.abs(curvature).max())
         solution: tuple[Any, ...] = daqp.solve(
-            curvature / scale + REGULARIZATION * np.eye(len(free)),
+            curvature / scale + SPLINE_REGULARIZATION * np.eye(len(free)),
             gradient / scale,
             np.ascontiguousarray(rows),
             upper,
