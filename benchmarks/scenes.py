@@ -33,6 +33,7 @@ from cnpgen.kernels.collision.collision_checker import (
 )
 from cnpgen.kernels.collision.tree_search import TreeSettings, find_tree_path
 from cnpgen.kernels.library import KernelLibrary, choose_backend
+from cnpgen.pipelines.resting_states import RestingStates
 from cnpgen.plans.boundary_problems import plans_of_rows
 from cnpgen.plans.plans import Plans
 from cnpgen.plans.scene_plans import scene_plans
@@ -44,7 +45,6 @@ from cnpgen.problems.problem_file import load_problem
 from cnpgen.problems.problem_record import as_problem, record_problem
 from cnpgen.refine.options import DEFAULT_OPTIONS, RefineOptions
 from cnpgen.refine.refine_engine import prepare, refine_serially
-from cnpgen.refine.solver.hulls import Hulls
 from cnpgen.refine.task import Attempt
 from cnpgen.robots.obstacle import Obstacle
 from cnpgen.robots.robot import Robot
@@ -662,16 +662,11 @@ def checks(states: int) -> dict[str, float]:
         if total > states:
             break
     recorded = np.concatenate(edges, axis=1)
-    hulls, poses = (
-        Hulls(base.with_obstacles(obstacles), robot),
-        place_obstacles(obstacles),
-    )
+    by_coal = RestingStates(base.with_obstacles(obstacles), robot)
     part = recorded[:, : states // 50]
     times = [median(cpu_of(lambda: checker.clear_states(recorded)) for _ in range(5))]
-    times.append(cpu_of(lambda: hulls.clear_states(part, poses)))
-    equal = bool(
-        np.array_equal(checker.clear_states(part), hulls.clear_states(part, poses))
-    )
+    times.append(cpu_of(lambda: by_coal.are_clear(part)))
+    equal = bool(np.array_equal(checker.clear_states(part), by_coal.are_clear(part)))
     close = cpu_of(
         lambda: [
             checker.close_bodies(recorded[:, :100], 0.04, of_obstacles=kind)

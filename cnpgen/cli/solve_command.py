@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from cnpgen.cli import recipe_names, values
-from cnpgen.cli.parser import Parser, options_of, refuse
+from cnpgen.cli.parser import EXTRAPOLATE, Parser, options_of, refuse
 from cnpgen.cli.refine_command import (
     ALLOW_UNUSED,
     LARGE_ANGLES,
@@ -60,6 +60,8 @@ def add_options(parser: Parser) -> None:
     )
     text = "the problem of boundary conditions in HDF5; its tolerances are used"
     option("--problem", metavar="NAME|FILE", type=recipe_names.problem, help=text)
+    text = f"{EXTRAPOLATE}, in HDF5"
+    option("--extrapolate", action="store_true", default=None, help=text)
     text = "solve scenes with this problem of a robot, such as panda"
     option("--robot", metavar="NAME|FILE", type=recipe_names.problem, help=text)
     option("--allow-unused", metavar="KEY", action="append", help=ALLOW_UNUSED)
@@ -118,7 +120,7 @@ def _solve_scenes(arguments: argparse.Namespace, out: Path) -> int:
 
     refuse(
         arguments,
-        ["split", "seed", "problem"],
+        ["split", "seed", "problem", "extrapolate"],
         "--robot is for scenes, which have --first and --n",
     )
     problem = as_problem(arguments.robot)
@@ -215,8 +217,8 @@ def _rows(arguments: argparse.Namespace) -> "Plans":
     )
     refuse(
         arguments,
-        ["problem"],
-        "--problem is for boundary conditions in HDF5; a dataset contains its problem",
+        ["problem", "extrapolate"],
+        "--problem and --extrapolate are for boundary conditions in HDF5; a dataset contains its problem",
     )
     split = arguments.split or "validation"
     return load_boundary_problems(
@@ -241,6 +243,7 @@ def _conditions(arguments: argparse.Namespace) -> "Plans":
         arguments.what,
         problem=arguments.problem,
         allow_large_angles=arguments.allow_large_angles,
+        extrapolate=bool(arguments.extrapolate),
     )
     if not len(problems):
         raise DatasetError(f"no boundary conditions in {arguments.what}")
@@ -257,8 +260,8 @@ def _draws(arguments: argparse.Namespace) -> "Plans":
     refuse(arguments, ["split", "first"], of_rows)
     refuse(
         arguments,
-        ["problem"],
-        "--problem is for boundary conditions in HDF5; a recipe contains its problem",
+        ["problem", "extrapolate"],
+        "--problem and --extrapolate are for boundary conditions in HDF5; a recipe contains its problem",
     )
     if arguments.n is None:
         raise UsageError(

@@ -332,6 +332,8 @@ def _plans_of(
 
 def _goals(problem: Problem, robot: Robot, scene: SceneProblem, index: int) -> Array:
     """Return the goal states of a scene that are tried, in this order, shape (G, n), G > 0."""
+    if scene.goal_pose is not None:
+        _frame_of(robot, scene, scene.goal_pose)
     if scene.other_goal_poses:
         return _of_alternatives(problem, robot, scene, index)
     if not len(scene.goal_q):

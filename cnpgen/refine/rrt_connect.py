@@ -111,7 +111,7 @@ class RestSpace:
         first = _first(~np.logical_and.reduce(met[~self.capsules]))
         if first:
             first = _first(
-                ~self.hulls.clear_states(q[:, :first], poses, uncovered_only=True)
+                ~self.hulls.clear_states(q[:, :first], poses, links_only=True)
             )
         resolved = np.logical_and.reduce(met[self.capsules]) & self.capsules.any()
         unresolved = np.flatnonzero(~resolved[:first])
