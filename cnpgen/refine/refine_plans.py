@@ -88,7 +88,7 @@ def refine_tasks(
     **run: Any,
 ) -> Refinement:
     """Refine plans, or plan where control points are nan; goal states of tasks are those of ``solve_plans``."""
-    refine = partial(refine_plans, options=options, **run)
+    refine: Callable[..., Refinement] = partial(refine_plans, options=options, **run)
     if GOAL_OPTION in plans.columns and len(plans):
         return refine_goal_options(
             plans,
