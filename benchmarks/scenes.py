@@ -43,7 +43,7 @@ from cnpgen.problems.load_robot import load_robot
 from cnpgen.problems.problem import Problem
 from cnpgen.problems.problem_file import load_problem
 from cnpgen.problems.problem_record import as_problem, record_problem
-from cnpgen.refine.options import DEFAULT_OPTIONS
+from cnpgen.refine.options import DEFAULT_OPTIONS, RefineOptions
 from cnpgen.refine.refine_engine import prepare, refine_serially
 from cnpgen.refine.task import Attempt
 from cnpgen.robots.obstacle import Obstacle
@@ -506,11 +506,18 @@ def boundary_columns(start: Array, goal: Array) -> dict[str, Array]:
     return columns | {"start_xyz": np.zeros((1, 3)), "goal_xyz": np.zeros((1, 3))}
 
 
-def solve_scene(problem: Problem, start: Array, goal: Array) -> Solved:
+def solve_scene(
+    problem: Problem,
+    start: Array,
+    goal: Array,
+    refine_options: RefineOptions = DEFAULT_OPTIONS,
+) -> Solved:
     """Solve a new scene."""
     columns = boundary_columns(start, goal)
     return solve_problem(
-        lambda: plans_of_rows(record_problem(problem), columns), problem.obstacle
+        lambda: plans_of_rows(record_problem(problem), columns),
+        problem.obstacle,
+        refine_options,
     )
 
 
@@ -525,14 +532,16 @@ def solve_suite(problem: Problem, count: int) -> list[Solved]:
 
 
 def solve_problem(
-    set_up: Callable[[], Plans], obstacles: tuple[Obstacle, ...]
+    set_up: Callable[[], Plans],
+    obstacles: tuple[Obstacle, ...],
+    refine_options: RefineOptions = DEFAULT_OPTIONS,
 ) -> Solved:
     """Set up one boundary problem and solve it; the CPU time includes both."""
     begun = time.process_time()
     plans = set_up()
     prepare(plans, DEFAULT_OPTIONS)
     ready = time.process_time()
-    (attempt,) = refine_serially(plans, DEFAULT_OPTIONS)
+    (attempt,) = refine_serially(plans, refine_options)
     return Solved(plans, attempt, obstacles, ready - begun, time.process_time() - begun)
 
 

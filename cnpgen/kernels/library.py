@@ -19,6 +19,7 @@ from cnpgen.kernels.c_library import ARRAYS, load_library
 from cnpgen.kernels.compiled_kernel import CompiledGridKernel, CompiledKernel
 from cnpgen.kernels.interpreted_kernel import InterpretedGridKernel, InterpretedKernel
 from cnpgen.kernels.kernel import GridKernel, Kernel
+from cnpgen.kernels.shipped_tapes import find_shipped
 from cnpgen.kernels.tape import CODES, Dtype, GridSpec, Loop, Tape, tape_from_function
 from cnpgen.schema import addons, registry
 from cnpgen.schema.registry import package_digest
@@ -136,17 +137,16 @@ class KernelLibrary:
         identity = {
             "builder": f"{builder.__module__}.{builder.__qualname__}",
             "source": _source_digests(builder),
-            "versions": _versions(),
             "problem": self.identity,
             "loop": [loop.tolerance, loop.limit] if loop else None,
             "grid": [grid.arguments, grid.results] if grid else None,
             "dtype": dtype,
             "parameters": parameters,
         }
-        digest = hashlib.sha256(
-            json.dumps(identity, sort_keys=True).encode()
-        ).hexdigest()
-        name = f"{builder.__name__}-{digest[:24]}.npy"
+        # The tapes of the package do not depend on the installed CasADi.
+        if (tape := find_shipped(_key(builder, identity))) is not None:
+            return tape
+        name = f"{_key(builder, identity | {'versions': _versions()})}.npy"
         if (tape := self._cached(name)) is None:
             tape = tape_from_function(
                 self._build(builder, parameters), loop, grid=grid, dtype=dtype
@@ -176,6 +176,12 @@ class KernelLibrary:
             make_private_folder(path.parent)
             write_file(path, tape.to_bytes())
             make_read_only_for_others(path)
+
+
+def _key(builder: Callable[..., Any], identity: Mapping[str, Any]) -> str:
+    """Return the name of a tape: that of its builder and a digest of its identity."""
+    digest = hashlib.sha256(json.dumps(identity, sort_keys=True).encode()).hexdigest()
+    return f"{builder.__name__}-{digest[:24]}"
 
 
 @cache

@@ -4,6 +4,7 @@ import dataclasses
 import hashlib
 import json
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -35,7 +36,7 @@ from cnpgen.robots.scene import PARKED_POSITION_M
 from cnpgen.robots.shape.inline import with_inline_meshes
 from cnpgen.robots.shape.mesh_files import find_urdf
 from cnpgen.robots.solid import pose_width
-from cnpgen.robots.urdf import read_urdf
+from cnpgen.robots.urdf import read_urdf, urdf_tree
 from cnpgen.robots.urdf_changes import (
     PAYLOAD,
     with_collision_geometry,
@@ -45,6 +46,7 @@ from cnpgen.robots.urdf_changes import (
     with_payload_link,
     with_point_masses,
 )
+from cnpgen.robots.urdf_elements import check_elements
 from cnpgen.schema import registry
 from cnpgen.schema.argument_types import checked_arguments
 from cnpgen.schema.keys import NAME, Range, field, to_dict
@@ -412,9 +414,12 @@ class Problem:
             return self.same_robot.urdf_text
         spec = self.robot
         positions = dict(zip(spec.locked_joints, spec.locked_positions, strict=True))
-        text = with_locked_joints(
-            read_urdf(self.urdf_path), positions, is_stored=self.is_stored
-        )
+        text = read_urdf(self.urdf_path)
+        if not self.is_stored:
+            # The reader of the robot raises errors about the text itself.
+            with suppress(ValueError):
+                check_elements(urdf_tree(text), self.urdf_path)
+        text = with_locked_joints(text, positions, is_stored=self.is_stored)
         text = with_point_masses(text)
         if not self.uses_link_geometry:
             return text

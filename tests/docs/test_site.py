@@ -295,6 +295,15 @@ def test_the_gallery_is_part_of_the_site(site: Path) -> None:
 
 
 @pytest.mark.extended
+def test_pages_of_planners_are_part_of_the_site_and_linked(site: Path) -> None:
+    pytest.importorskip("ziglang")
+    text = (site / "docs" / "how-to" / "deploy.html").read_text(encoding="utf-8")
+    linked = re.findall(r'href="../../interactive/(\w+).html"', text)
+    pages = [path.stem for path in (site / "interactive").glob("*.html")]
+    assert sorted(linked) == sorted(pages) == ["puck", "transport"]
+
+
+@pytest.mark.extended
 @needs_chromium
 def test_the_pages_of_the_gallery_run_without_an_error_and_draw_their_scene(
     site: Path, address: str, tmp_path: Path

@@ -1,7 +1,7 @@
 """The scene of a page: the robot, and one or more views of it with obstacles, curves and the verdict."""
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -38,6 +38,7 @@ from cnpgen.world.forward_kinematics import ForwardKinematics
 from cnpgen.world.path import PathWorld
 
 FRAMES_PER_MOTION = 240
+NOT_MEASURED = -np.inf  # violation of a condition that samples do not determine
 # Of obstacles without a lower end, which are drawn down to the floor.
 MIN_DRAWN_HEIGHT_M = 0.1
 DRAWN_TABLE_M = 5e-3  # thickness of a drawn table
@@ -136,7 +137,12 @@ def scene_of_trajectories(
     """Show sampled trajectories, by the interpolation that their derivatives determine."""
     views = []
     for trajectory, title, verdict in zip(trajectories, titles, verdicts, strict=True):
-        margins = {name: entry.margin for name, entry in verdict.conditions.items()}
+        margins = {
+            name: entry.margin
+            if entry.is_measured
+            else replace(entry.margin, violation=NOT_MEASURED)
+            for name, entry in verdict.conditions.items()
+        }
         extra = [margin.time for margin in margins.values() if not margin.ok]
         with np.errstate(all="ignore"):
             world, s, times, scene = along_trajectory(
@@ -243,6 +249,8 @@ def _verdict(
 
 def _margin_text(margin: Margin) -> str:
     """Return a margin as text in the units of plots."""
+    if margin.violation == NOT_MEASURED:
+        return "not measured: the samples do not determine it"
     factor, unit = plot_unit(margin.unit)
     side = "outside" if margin.violation > 0 else "inside"
     amount, tolerance = factor * abs(margin.violation), factor * margin.tolerance
