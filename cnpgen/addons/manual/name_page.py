@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import cnpgen
-from cnpgen.addons.manual.tables import reference_table
+from cnpgen.addons.manual.reference_tables import reference_table
 from cnpgen.errors import MissingAddonError
 
 MODULES = (
