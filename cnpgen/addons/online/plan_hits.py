@@ -244,9 +244,9 @@ def _plan_moving(
     model: PuckModel,
 ) -> PlannedHits:
     """Plan hits of moving pucks; the lengths are the contact distance and the overlap [m]."""
-    completion, *positions, meeting_time = task
+    completion, state, puck, velocity, target, meeting_time = task
     distance, overlap = lengths
-    arguments = *positions, speed_share, meeting_time
+    arguments = state, puck, velocity, target, speed_share, meeting_time
     moving = MovingHits(
         planner.robot.n, arguments, model=model, distance=distance, overlap=overlap
     )
