@@ -244,9 +244,9 @@ def _plan_moving(
     model: PuckModel,
 ) -> PlannedHits:
     """Plan hits of moving pucks; the lengths are the contact distance and the overlap [m]."""
-    completion, state, puck, target, velocity, meeting_time = task
+    completion, state, puck, velocity, target, meeting_time = task
     distance, overlap = lengths
-    arguments = state, puck, target, velocity, speed_share, meeting_time
+    arguments = state, puck, velocity, target, speed_share, meeting_time
     moving = MovingHits(
         planner.robot.n, arguments, model=model, distance=distance, overlap=overlap
     )
