@@ -48,17 +48,17 @@ def run(tree: Path, command: str, folder: Path, cache: Path) -> dict[str, float]
         cwd=tree,
         stdout=subprocess.DEVNULL,
     )
-    background: dict[int, float] = {}
+    background, waited_for = dict[int, float](), set[int]()
     while process.poll() is None:
         background |= background_times(cache)
+        # The command has waited for these: their times count as its own.
+        waited_for = {each for each in background if not Path(f"/proc/{each}").exists()}
         time.sleep(POLL_INTERVAL_S)
     if process.returncode:
         raise SystemExit(f"{command}: exit code {process.returncode}")
     after = resource.getrusage(resource.RUSAGE_CHILDREN)
-    # A command waits for its detached process, so that the time of one that has ended counts as its own.
-    ended = set(background).difference(background_times(cache))
     times = after.ru_utime - before.ru_utime + after.ru_stime - before.ru_stime
-    times -= sum(background[process] for process in ended)
+    times -= sum(background[each] for each in waited_for)
     begun = time.monotonic()
     while running := background_times(cache):
         background |= running

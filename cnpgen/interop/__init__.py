@@ -1,1 +1,1 @@
-"""Bridges to torch and JAX (the add-on ``cnpgen.addons.frameworks``), each used only if its framework is installed."""
+"""Bridges to torch, JAX and LeRobot (the add-on ``cnpgen.addons.frameworks``), each used only if it is installed."""

@@ -8,7 +8,7 @@ from contextlib import suppress
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -81,6 +81,16 @@ class Objective:
         """All terms in addition to the duration."""
         own = (Centrifugal(weight=self.centrifugal),) if self.centrifugal > 0 else ()
         return (*own, *self.term)
+
+
+class SceneColumns(NamedTuple):
+    """Columns of the values of a scene, ``obstacle_poses`` of kernels and ``Scene.poses``."""
+
+    obstacles: slice  # their poses and sizes
+    constraint: (
+        slice  # values of ``Problem.scene_constraint``, such as a puck's position
+    )
+    parameters: slice
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -338,13 +348,19 @@ class Problem:
         )
 
     @property
-    def scene_width(self) -> int:
-        """Number of values of a scene: poses and sizes of obstacles, those of the constraint above, parameters."""
+    def scene_columns(self) -> SceneColumns:
+        """Columns of the values of a scene."""
         constraint = self.scene_constraint
-        width = pose_width(self.obstacle) + (
-            0 if constraint is None else constraint.scene_width
-        )
-        return width + len(self.parameters)
+        obstacles = pose_width(self.obstacle)
+        own = obstacles + (0 if constraint is None else constraint.scene_width)
+        end = own + len(self.parameters)
+        return SceneColumns(slice(obstacles), slice(obstacles, own), slice(own, end))
+
+    @property
+    def scene_width(self) -> int:
+        """Number of values of a scene."""
+        width: int = self.scene_columns.parameters.stop
+        return width
 
     @property
     def uses_link_geometry(self) -> bool:

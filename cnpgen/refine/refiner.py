@@ -401,10 +401,9 @@ class Refiner:
     def tip_path_guesses(self, task: RefinementTask) -> Iterator[Array]:
         """Yield the variables of motions along the initial tip paths of the problem's constraint."""
         constraint = self.problem.scene_constraint
-        # Of all values before the parameters.
-        width = self.problem.scene_width - len(self.problem.parameters)
-        values = task.scene.poses[0, pose_width(self.problem.obstacle) : width]
-        frame = table_frame_of(self.problem, task.scene.poses[:, width:])
+        columns, poses = self.problem.scene_columns, task.scene.poses
+        values = poses[0, columns.constraint]
+        frame = table_frame_of(self.problem, poses[:, columns.parameters])
         start = (
             task.start_xyz if frame is None else frame.to_table(task.start_xyz[None])[0]
         )

@@ -23,6 +23,9 @@ Pose = tuple[Array, Array]
 # exact to 1e-9 m. The others are for cases that the first one fails.
 GJK_EPA_TOLERANCES = ((1e-9, 1e-6), (1e-6, 1e-6), (1e-6, 1e-4))
 MAX_CERTIFICATE_GAP_M = 1e-6  # between a measured distance and its certificate
+MAX_BLOCK_PRODUCTS = 65_536  # of corners and directions, per temporary array
+MIN_CELL_CORNERS = 256  # of a body whose corners are searched by cells of directions
+CELLS = 4  # from the middle of a face of the cube of directions to its edge
 
 
 @dataclass(frozen=True)
@@ -53,6 +56,58 @@ class ConvexBody:
             + self.radius
             + direction @ origin
         )
+
+    def lowest_products(self, directions: Array) -> Array:
+        """Return the smallest product of the corners with each of K unit vectors, shape (3, K).
+
+        Hulls of meshes have thousands of corners, of which few can be the lowest along
+        similar directions. So directions are rounded to cells of a cube, and each cell
+        keeps its candidates.
+        """
+        if len(self.corners) < MIN_CELL_CORNERS or not np.isfinite(directions).all():
+            return lowest_products(self.corners, directions)
+        lowest = np.empty(directions.shape[1])
+        scaled = CELLS / np.abs(directions).max(axis=0, initial=0.5)
+        cells = np.rint(directions * scaled).astype(int)
+        codes = np.array([1, 64, 4096]) @ (cells + CELLS)
+        for code in np.unique(codes).tolist():
+            (members,) = np.nonzero(codes == code)
+            if (corners := self._candidates.get(code)) is None:
+                corners = self._lowest_in_cell(cells[:, members[0]])
+                self._candidates[code] = corners
+            lowest[members] = lowest_products(corners, directions[:, members])
+        return lowest
+
+    @cached_property
+    def _candidates(self) -> dict[int, Array]:
+        """Cell of directions -> corners that are the lowest along one of them."""
+        return {}
+
+    def _lowest_in_cell(self, cell: Array) -> Array:
+        """Return the corners that can be the lowest along a direction that is rounded to a cell, shape (V', 3).
+
+        Such a unit vector d differs from the cell's own u by at most e = sqrt(1/2) /
+        CELLS: the cell is at least CELLS from the origin. With the lowest corner c* of
+        u, d (c - c*) >= u (c - c*) - e |c - c*|, so c is never the lowest if this is
+        positive.
+        """
+        direction = cell / np.linalg.norm(cell)
+        heights = self.corners @ direction
+        apart = np.linalg.norm(self.corners - self.corners[heights.argmin()], axis=1)
+        # The factor covers rounding.
+        reach = 1.001 * np.sqrt(0.5) / CELLS * apart
+        return np.asarray(self.corners[heights - heights.min() <= reach])
+
+
+def lowest_products(corners: Array, directions: Array) -> Array:
+    """Return the smallest product of N corners with each of K directions, shape (K,), in blocks for the cache."""
+    size = max(MAX_BLOCK_PRODUCTS // max(directions.shape[1], 1), 1)
+    lowest = (corners[:size] @ directions).min(axis=0)
+    for first in range(size, len(corners), size):
+        np.minimum(
+            lowest, (corners[first : first + size] @ directions).min(axis=0), out=lowest
+        )
+    return np.asarray(lowest)
 
 
 PlacedBody = tuple[ConvexBody, Pose]

@@ -15,8 +15,6 @@ from cnpgen.world.pair_distances import PairDistances
 
 Pairs = NDArray[np.intp]
 
-MAX_BLOCK_PRODUCTS = 65_536  # of corners and directions, per temporary array
-
 NO_SHAPE = 'a constraint needs the link geometry of the robot, which has none: set geometry = "urdf" in [robot]'
 NO_HELD_SHAPE = (
     "a constraint needs the geometry of the links and a held object: the problem needs [object], and <collision>"
@@ -198,19 +196,8 @@ class RigidBodies:
         # Along u: min over b of u . x - max over a of u . x, both with their radii.
         reach = float((first.corners @ direction).max()) + first.radius + second.radius
         return np.asarray(
-            lowest_products(second.corners, in_b[:, states]) + shift[states] - reach
+            second.lowest_products(in_b[:, states]) + shift[states] - reach
         )
-
-
-def lowest_products(corners: Array, directions: Array) -> Array:
-    """Return the smallest product of N corners with each of K directions, shape (K,), in blocks for the cache."""
-    size = max(MAX_BLOCK_PRODUCTS // max(directions.shape[1], 1), 1)
-    lowest = (corners[:size] @ directions).min(axis=0)
-    for first in range(size, len(corners), size):
-        np.minimum(
-            lowest, (corners[first : first + size] @ directions).min(axis=0), out=lowest
-        )
-    return np.asarray(lowest)
 
 
 def _pairs(pairs: Any) -> Pairs:

@@ -718,7 +718,9 @@ def _of_runtime() -> list[ValidCall]:
         ),
         ValidCall("ChunkExecutor.reset", reset, {"measured": (base, still)}),
         ValidCall("ChunkExecutor.stop", executor.stop),
+        ValidCall("ChunkOptions", results.ChunkOptions, {"noise": 1e-3}),
         ValidCall("ChunkExecutor.set_point", executor.set_point, {"time": 0.0}),
+        ValidCall("ChunkExecutor.state_at", executor.state_at, {"time": 0.0}),
         ValidCall(
             "ChunkExecutor.step",
             executor.step,

@@ -25,6 +25,8 @@ from cnpgen.make.recipe import load_dataset_recipe
 from cnpgen.pipelines.prepared import PreparedPipeline
 from cnpgen.planner.planner import Planner
 from cnpgen.problems.load_robot import load_robot
+from cnpgen.problems.obstacles import with_capacity
+from cnpgen.problems.problem_file import load_problem
 from cnpgen.refine.refiner import Refiner
 
 ROOT = Path(__file__).parents[2]
@@ -62,9 +64,14 @@ def load_kernels(name: str) -> None:
         Planner(name)
 
 
-def shipped_datasets() -> list[str]:
-    """List the shipped datasets."""
-    return sorted(path.stem for path in (ROOT / "datasets").glob("*.toml"))
+def load_all() -> None:
+    """Load all kernels of shipped datasets, and those of the solver for scenes of a Panda."""
+    for path in sorted((ROOT / "datasets").glob("*.toml")):
+        load_kernels(path.stem)
+        print(path.stem, flush=True)
+    # They do not depend on the number of obstacles.
+    scenes = with_capacity(load_problem("panda"), {"box": 1})
+    Refiner(scenes, load_robot(scenes))
 
 
 def names_of(tapes: dict[str, Tape]) -> dict[str, str]:
@@ -86,9 +93,7 @@ def write(tapes: dict[str, Tape], folder: Path) -> None:
 def main() -> None:
     """Make the files of the package."""
     with recorded() as tapes:
-        for name in shipped_datasets():
-            load_kernels(name)
-            print(f"{name}: {len(tapes)} tapes")
+        load_all()
     write(tapes, shipped_tapes.FOLDER)
 
 

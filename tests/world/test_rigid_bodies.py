@@ -13,8 +13,8 @@ from cnpgen.problems.load_robot import load_robot
 from cnpgen.problems.problem import Problem
 from cnpgen.problems.problem_file import load_problem
 from cnpgen.robots.robot import Robot
+from cnpgen.world.certified import convex_body, lowest_products
 from cnpgen.world.path import PathWorld
-from cnpgen.world.rigid_bodies import lowest_products
 from cnpgen.world.world import World
 from tests.examples.meshes import Meshes
 from tests.examples.shaped_robot import LINKS, write_problem
@@ -192,3 +192,30 @@ def test_smallest_products_in_blocks_are_those_of_the_whole(
     np.testing.assert_allclose(
         lowest_products(points, along), expected, rtol=1e-12, atol=1e-14
     )
+
+
+@pytest.mark.parametrize("shape", ["ball", "box", "flat"])
+def test_corners_of_cells_of_directions_have_the_smallest_products_of_all(
+    shape: str,
+) -> None:
+    random = np.random.default_rng(4)
+    points = random.normal(size=(3000, 3))
+    if shape == "ball":
+        points /= np.linalg.norm(points, axis=1, keepdims=True)
+    elif shape == "box":
+        points = np.clip(points, -1, 1) * [3.0, 1.0, 0.2]
+    else:
+        points[:, 2] = 0.0
+    directions = random.normal(size=(3, 5000))
+    directions[:, :6] = np.concatenate([np.eye(3), -np.eye(3)], axis=1)
+    # On the edges between cells of directions.
+    directions[:, 6:200] = random.choice([-1, -0.875, 0.125, 1, 0.375], (3, 194))
+    directions /= np.linalg.norm(directions, axis=0)
+    body = convex_body(points)
+    expected = (points @ directions).min(axis=0)
+    for _ in range(2):  # the second time with kept candidates
+        np.testing.assert_allclose(
+            body.lowest_products(directions), expected, rtol=1e-13, atol=1e-14
+        )
+    assert body.lowest_products(directions[:, :0]).shape == (0,)
+    assert np.isnan(body.lowest_products(np.full((3, 2), np.nan))).all()

@@ -20,7 +20,7 @@ from cnpgen.planner.time_parametrization import (
 from cnpgen.planner.time_scaling import MAX_TIME_SCALE, TIME_SCALE_MARGIN
 from cnpgen.trajectory.spline import basis, graded_edges, taylor_coefficients
 
-OUTPUT_BLOCK = 32  # outputs of a layer that are accumulated together
+LAYER_BLOCK = 32  # outputs of a layer that are accumulated together
 INPUTS = 4  # of a layer that pass at once
 GAUSS_NODES = (
     4  # half of those of ``Motion.duration``: errors of 1e-9 in the same cells
@@ -28,7 +28,7 @@ GAUSS_NODES = (
 NEWTON_STEPS = 5  # three or four reach rounding (``Motion.phase_at``)
 
 
-def padded(width: int, block: int = OUTPUT_BLOCK) -> int:
+def padded(width: int, block: int = LAYER_BLOCK) -> int:
     """Return the width of a layer, filled up to whole blocks."""
     return ceil(width / block) * block
 
@@ -75,7 +75,7 @@ def sizes(parts: PlannerParts) -> dict[str, int]:
         "CELL_STEPS": ceil(log2(len(edges))) + 1,
         "NODES": GAUSS_NODES,
         "NEWTON_STEPS": NEWTON_STEPS,
-        "BLOCK": OUTPUT_BLOCK,
+        "BLOCK": LAYER_BLOCK,
         "INPUTS": INPUTS,
         "LANES": LANES,
     }
@@ -249,10 +249,10 @@ def _step(layer: Layer, source: str, target: str, *, activated: bool) -> str:
     inputs, width = padded(layer.inputs, INPUTS), padded(layer.outputs)
     arrays = f"{layer.name}_weight, {layer.name}_bias"
     text = (
-        f"  affine({arrays}, {inputs}, {width // OUTPUT_BLOCK}, {source}, {target});\n"
+        f"  affine({arrays}, {inputs}, {width // LAYER_BLOCK}, {source}, {target});\n"
     )
     return text + (
-        f"  hyperbolic_tangent({target}, {width // OUTPUT_BLOCK});\n"
+        f"  hyperbolic_tangent({target}, {width // LAYER_BLOCK});\n"
         if activated
         else ""
     )
@@ -266,6 +266,6 @@ def _filled(matrix: NDArray[Any]) -> NDArray[Any]:
 
 
 def _blocked(weight: NDArray[Any]) -> NDArray[Any]:
-    """Return a matrix as blocks of columns, shape (blocks, inputs, BLOCK)."""
+    """Return a matrix as blocks of columns, shape (blocks, inputs, LAYER_BLOCK)."""
     filled = _filled(weight)
-    return filled.reshape(len(filled), -1, OUTPUT_BLOCK).swapaxes(0, 1)
+    return filled.reshape(len(filled), -1, LAYER_BLOCK).swapaxes(0, 1)

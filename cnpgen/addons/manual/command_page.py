@@ -4,7 +4,7 @@ import argparse
 import re
 from collections.abc import Iterator
 
-from cnpgen.addons.manual.tables import escaped, reference_table
+from cnpgen.addons.manual.reference_tables import escaped, reference_table
 from cnpgen.cli.main import build_parser
 from cnpgen.cli.parser import Commands
 

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import cnpgen
-from cnpgen.addons.manual.tables import reference_table
+from cnpgen.addons.manual.reference_tables import reference_table
 from cnpgen.errors import MissingAddonError
 
 MODULES = (
@@ -23,7 +23,7 @@ MODULES = (
     "errors",
 )
 # Their modules are read without an import of the framework.
-BRIDGES = ("torch", "jax")
+BRIDGES = ("torch", "jax", "lerobot")
 
 _INTRODUCTION = """\
 # Python interface

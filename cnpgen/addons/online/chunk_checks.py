@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -13,15 +14,37 @@ from cnpgen.addons.trajectories.sampled_trajectory import Trajectory
 from cnpgen.arrays import Array
 from cnpgen.errors import UsageError
 from cnpgen.judges.plans.joint_limits import joint_limits
+from cnpgen.plans.plausible import check_units_of_states
 from cnpgen.problems.constraints.joint import JointPosition
 from cnpgen.problems.problem import Problem
 from cnpgen.robots.robot import Robot
-from cnpgen.schema.arguments import check_range, number, numbers
+from cnpgen.schema.argument_types import check_fields
+from cnpgen.schema.arguments import check_range, concerning, number, numbers
 from cnpgen.world.path import PathWorld
 
 MIN_CHUNK_SAMPLES = 8  # of a chunk after the join: fewer have no reliable velocity
 MAX_DURATION = 1.2  # of a motion, in chunk lengths
 SAMPLE_ROUNDING = 1e-6  # samples
+NOISE_RAD = 1e-3
+MAX_RESTING_SPEED = 0.05  # fraction of the velocity limits, of an arm that is at rest
+
+
+@dataclass(frozen=True)
+class ChunkOptions:
+    """Further options of ``ChunkExecutor``.
+
+    Attributes:
+        noise: Largest random error of a chunk's positions [rad]. A chunk is refused if
+            no motion within it meets the limits of velocities, accelerations and jerks.
+        stop_after: Time after a join at which the arm rests at the latest without
+            another chunk [s]; by default 1.2 chunk lengths. Later samples are not used.
+    """
+
+    noise: float = NOISE_RAD
+    stop_after: float | None = None
+
+    def __post_init__(self) -> None:
+        check_fields(self)
 
 
 class ChunkChecks:
@@ -65,7 +88,8 @@ class ChunkChecks:
                 f"has {values.shape[1]} columns, earlier ones have {self._columns}",
                 argument="chunk",
             )
-        return values[:, :n], values[:, n:]
+        # The other columns are kept, and the caller may reuse the array.
+        return values[:, :n], values[:, n:].copy()
 
     def keep_columns(self, columns: int) -> None:
         """Demand a number of columns of all later chunks."""
@@ -94,6 +118,30 @@ def checked_state(measured: tuple[ArrayLike, ArrayLike], n: int) -> tuple[Array,
             argument="measured",
         )
     return state[0], state[1]
+
+
+def check_rest(
+    robot: Robot, names: Sequence[str], state: tuple[Array, Array], error: Array
+) -> None:
+    """Refuse a measured state, shape (n,) each, that is outside the position limits by more than an error, or moves."""
+    q, dq = state
+    if not np.isfinite(q).all():
+        raise UsageError(f"must be finite, got {q}", argument="measured")
+    with concerning("measured"):
+        check_units_of_states(
+            robot, {"start_q": q[None], "start_dq": dq[None]}, noun="state"
+        )
+    outside = np.maximum(robot.position_lower - q, q - robot.position_upper)
+    if (outside > error).any():
+        joint = int(np.argmax(outside))
+        text = f"{names[joint]} is {outside[joint]:.3g} rad outside its position limits"
+        raise UsageError(text, concerns="measured")
+    resting = np.abs(dq) <= MAX_RESTING_SPEED * robot.velocity_limit
+    if not resting.all():
+        # Nan does not rest.
+        joint = int(resting.argmin())
+        text = f"the arm must be at rest, but {names[joint]} moves at {dq[joint]:.3g} rad/s"
+        raise UsageError(text, concerns="measured")
 
 
 def checked_errors(tracking_error: ArrayLike, n: int) -> Array:

@@ -13,7 +13,9 @@ from cnpgen.addons.online.callers_clock import ROUNDING_S, CallersClock
 from cnpgen.addons.online.chunk_checks import (
     MIN_CHUNK_SAMPLES,
     ChunkChecks,
+    ChunkOptions,
     bounded,
+    check_rest,
     checked_errors,
     checked_state,
     horizon,
@@ -26,21 +28,18 @@ from cnpgen.addons.online.switches import ChunkJoin, SwitchOutcome
 from cnpgen.arrays import Array
 from cnpgen.errors import UsageError
 from cnpgen.machine.threads import one_thread
-from cnpgen.plans.plausible import check_units_of_states
 from cnpgen.problems.problem import Problem
 from cnpgen.problems.problem_record import as_record, open_problem
 from cnpgen.schema.argument_types import checked_arguments
-from cnpgen.schema.arguments import concerning, integer, number
+from cnpgen.schema.arguments import integer, number
 from cnpgen.store.dataset_spec import StoredProblem
 
-NOISE_RAD = 1e-3
 RATES_HZ, TIMES_S = (0.1, 1000.0), (1e-3, 60.0)  # ranges of options
 MAX_CHUNK_SAMPLES, MAX_SPEED = 1000, 10.0
 STOP_DELAY_S = 0.05  # of a stop after its cause: it is computed meanwhile
 MAX_POSITION = 1e6  # rad or m, of a chunk
 GRID_STEP_S = 4e-3  # of sampled motions, whose knots are 0.1 s apart
 MAX_MEASURED_SPEED = 1.1  # fraction of the velocity limits
-MAX_RESTING_SPEED = 0.05  # fraction of the velocity limits, of an arm that is at rest
 
 
 class ChunkExecutor:
@@ -72,10 +71,7 @@ class ChunkExecutor:
         stale_after: Largest age of an observation when its chunk arrives, and largest
             step of the clock between calls [s].
         speed: Largest speed along a chunk in units of its own timing, at least 1.
-        noise: Largest random error of a chunk's positions [rad]. A chunk is refused if
-            no motion within it meets the limits of velocities, accelerations and jerks.
-        stop_after: Time after a join at which the arm rests at the latest without
-            another chunk [s]; by default 1.2 chunk lengths. Later samples are not used.
+        options: Noise of chunks, and a shorter time to rest.
 
     Raises:
         UsageError: A number is not positive, the speed is below 1, the chunk has too
@@ -96,8 +92,7 @@ class ChunkExecutor:
         tracking_error: float | ArrayLike,
         stale_after: float,
         speed: float = 1.0,
-        noise: float = NOISE_RAD,
-        stop_after: float | None = None,
+        options: ChunkOptions | None = None,
     ) -> None:
         self._record = as_record(problem)
         opened, self._robot = open_problem(self._record)
@@ -110,7 +105,8 @@ class ChunkExecutor:
         self._stale_after = bounded("stale_after", stale_after, *TIMES_S, "s")
         self._tracking_error = checked_errors(tracking_error, self._robot.n)
         max_speed = bounded("speed", speed, 1.0, MAX_SPEED, "times the own one")
-        if stop_after is not None:
+        options = options or ChunkOptions()
+        if (stop_after := options.stop_after) is not None:
             stop_after = bounded("stop_after", stop_after, *TIMES_S, "s")
         self._horizon = horizon(stop_after, self._length, self._rate)
         self._checks = ChunkChecks(
@@ -118,7 +114,7 @@ class ChunkExecutor:
             self._robot,
             length=self._length,
             rate=self._rate,
-            noise=positive("noise", noise),
+            noise=positive("noise", options.noise),
         )
         self._motions = ChunkMotions(self._record, self._rate, max_speed)
         # Numbers of samples that delays leave, one of each parametrization of motions.
@@ -151,31 +147,8 @@ class ChunkExecutor:
             UsageError: The arm moves, or a stop has not ended.
         """
         q, dq = checked_state(measured, self._robot.n)
-        if not np.isfinite(q).all():
-            raise UsageError(f"must be finite, got {q}", argument="measured")
-        with concerning("measured"):
-            check_units_of_states(
-                self._robot, {"start_q": q[None], "start_dq": dq[None]}, noun="state"
-            )
-        outside = np.maximum(
-            self._robot.position_lower - q, q - self._robot.position_upper
-        )
-        if (outside > self._tracking_error).any():
-            joint = int(np.argmax(outside))
-            raise UsageError(
-                f"{self._record.joint_names[joint]} is {outside[joint]:.3g} rad outside"
-                " its position limits",
-                concerns="measured",
-            )
-        resting = np.abs(dq) <= MAX_RESTING_SPEED * self._robot.velocity_limit
-        if not resting.all():
-            # Nan does not rest.
-            joint = int(resting.argmin())
-            name = self._record.joint_names[joint]
-            raise UsageError(
-                f"the arm must be at rest, but {name} moves at {dq[joint]:.3g} rad/s",
-                concerns="measured",
-            )
+        names = self._record.joint_names
+        check_rest(self._robot, names, (q, dq), self._tracking_error)
         with self._lock:
             if self._latched is None:
                 raise UsageError("the executor has not stopped, so it cannot be reset")
@@ -214,6 +187,21 @@ class ChunkExecutor:
         runtime, inner = self._read_clock(number("time", time))
         state = runtime.set_point(inner)
         return ChunkSetPoint(*state, self._progress.others_at(inner))
+
+    @checked_arguments
+    def state_at(self, time: float) -> ChunkSetPoint:
+        """Return the set point at a future time [s], which a later chunk may replace, or at one that has passed.
+
+        Times more than ``2 stale_after`` before the last set point are refused.
+
+        Raises:
+            UsageError: The time is too early, or the executor was never reset.
+        """
+        runtime, offset = self._checked_runtime(), self._clock.offset
+        at = number("time", time)
+        # Without a set point, the clocks have no common time: the arm rests at reset.
+        inner = runtime.now if offset is None else at - offset
+        return ChunkSetPoint(*runtime.state_at(inner), self._progress.others_at(inner))
 
     @checked_arguments
     @one_thread()

@@ -22,10 +22,7 @@ _LOG = logging.getLogger(__name__)
 def warn_of_unneeded_packages(
     documents: Mapping[Path, Any], packages: Sequence[Path]
 ) -> None:
-    """Warn of folders of packages if no document names a mesh file; SceneError for one that is missing."""
-    for folder in packages:
-        if not folder.is_dir():
-            raise SceneError(f"no such folder of packages: {folder}")
+    """Warn of folders of packages if no document names a mesh file."""
     if packages and not any(map(_names_a_file, documents.values())):
         _LOG.warning("no scene names a mesh file: the packages are not needed")
 

@@ -81,9 +81,14 @@ def load_scenes(
     """
     path, start = Path(path), integer("start", start, least=0)
     stop = None if n is None else start + integer("n", n, least=1)
-    if not all(isinstance(each, str | Path) for each in packages):
+    is_list = not isinstance(packages, str | Path)
+    if not is_list or not all(isinstance(each, str | Path) for each in packages):
         raise UsageError(
-            f"must be paths of folders, got {packages}", argument="packages"
+            f"must be paths of folders, got {packages!r}", argument="packages"
+        )
+    if missing := [each for each in packages if not Path(each).is_dir()]:
+        raise UsageError(
+            f"must be folders, there is no {missing[0]}", argument="packages"
         )
     options = ReadingOptions(
         tuple(allow_unused), tuple(map(Path, packages)), present or {}

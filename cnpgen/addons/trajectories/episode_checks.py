@@ -35,6 +35,7 @@ NOMINAL_LAGS = (
     2  # distances in frames: a recorder that falls behind distorts longer ones
 )
 NOMINAL_JITTER = 0.5  # of a period, of times without a clock
+MAX_STALL_S = 0.25  # by which a frame of such a recorder may be late: findings that it explains are for review
 STILL_S = 1.0  # time of equal states while the actions change, that is reviewed
 MIN_EXCESS = 1e-6  # relative to a limit
 
@@ -211,9 +212,11 @@ def _limit_findings(
     noise, jitter = errors
     error, known, text = _noise(q, arm, noise)
     period = float(np.median(np.diff(episode.t)))
+    is_assumed = jitter is None and episode.is_nominal
     if jitter is None:
-        nominal = episode.is_nominal
-        jitter = NOMINAL_JITTER * period if nominal else time_rounding(episode.t)[1]
+        jitter = NOMINAL_JITTER * period if is_assumed else time_rounding(episode.t)[1]
+    # Half of a stall on either side of two frames.
+    largest = max(jitter, MAX_STALL_S / 2) if is_assumed else jitter
     basis = f"{text}; jitter {jitter:.2g} s"
     bounds = {
         "position": value_intervals(episode.t, q, error),
@@ -232,8 +235,12 @@ def _limit_findings(
         worst = _worst(limit, islice(found, lags))
         if worst is None:
             continue
-        joint, time, value, bound = worst
         proven = known and limit.basis == VENDOR and quantity != "acceleration"
+        if proven and quantity == "velocity" and largest > jitter:
+            stalled = first_derivatives(episode.t, q, error, largest)
+            proven = (of_stall := _worst(limit, islice(stalled, lags))) is not None
+            worst = of_stall or worst
+        joint, time, value, bound = worst
         word = "at least" if value >= bound else "at most"
         unit = QUANTITIES[quantity]
         yield EpisodeFinding(

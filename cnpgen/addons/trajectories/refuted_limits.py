@@ -7,6 +7,7 @@ the number that is reported: no curve has less.
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from itertools import product
 
 import numpy as np
 
@@ -64,10 +65,14 @@ def refuted_limits(
     """Return the joint limits that no curve through samples within their errors meets, worst first."""
     found: dict[int, tuple[float, RefutedLimit]] = {}
     largest = largest_values(limits)
-    for order, samples, condition, bounds in _bounds(trajectory, errors, largest):
-        for limit, constraint in enumerate(limits.constraints):
-            if quantity_of(constraint) != _ORDERS[order]:
-                continue
+    bounded = [quantity_of(constraint) for constraint in limits.constraints]
+    for order, samples, condition, all_bounds in _bounds(trajectory, errors, largest):
+        name = _ORDERS[order]
+        # Bounds are computed one distance after the other, and only those of a limit.
+        for bounds, limit in product(
+            all_bounds if name in bounded else (),
+            [limit for limit, own in enumerate(bounded) if own == name],
+        ):
             excess, margin = _worst(limits, limit, bounds, trajectory.duration)
             if excess > found.get(limit, (MIN_VIOLATION,))[0]:
                 found[limit] = excess, RefutedLimit(margin, samples, condition)
@@ -105,8 +110,8 @@ def _worst(
 
 def _bounds(
     trajectory: Trajectory, errors: SampleErrors, largest: dict[str, Array]
-) -> Iterator[tuple[int, str, str, MeanDerivatives]]:
-    """Yield all bounds: order of the derivative, columns, condition, and the bounds of a distance."""
+) -> Iterator[tuple[int, str, str, Iterator[MeanDerivatives]]]:
+    """Yield all bounds: order of the derivative, columns, condition, and the bounds of all distances."""
     t, q, dq, ddq = trajectory.t, trajectory.q, trajectory.dq, trajectory.ddq
     # Under a limit V, a time within d moves a position by at most V d.
     moved = [
@@ -118,28 +123,22 @@ def _bounds(
         for name in ("velocity", "velocity or acceleration")
     ]
     # A position is reached at some time, whatever the jitter.
-    yield from _each(0, POSITIONS, "", value_intervals(t, q, errors.q))
+    yield (0, POSITIONS, "", value_intervals(t, q, errors.q))
     if np.isfinite(moved[0]):
         jerks = third_derivatives(t, q, errors.q + moved[0])
-        yield from _each(3, POSITIONS, conditions[0], jerks)
-    yield from _each(1, POSITIONS, "", first_derivatives(t, q, errors.q, errors.t))
-    yield from _each(2, POSITIONS, "", second_derivatives(t, q, errors.q, errors.t))
+        yield (3, POSITIONS, conditions[0], jerks)
+    yield (1, POSITIONS, "", first_derivatives(t, q, errors.q, errors.t))
+    yield (2, POSITIONS, "", second_derivatives(t, q, errors.q, errors.t))
     if dq is None:
         return
-    yield from _each(1, VELOCITIES, "", value_intervals(t, dq, errors.dq))
-    yield from _each(2, VELOCITIES, "", first_derivatives(t, dq, errors.dq, errors.t))
-    yield from _each(3, VELOCITIES, "", second_derivatives(t, dq, errors.dq, errors.t))
+    yield (1, VELOCITIES, "", value_intervals(t, dq, errors.dq))
+    yield (2, VELOCITIES, "", first_derivatives(t, dq, errors.dq, errors.t))
+    yield (3, VELOCITIES, "", second_derivatives(t, dq, errors.dq, errors.t))
     if np.isfinite(moved).all():
         of_both = errors.q + moved[0], errors.dq + moved[1]
         both = second_derivatives_with_velocities(t, q, dq, of_both)
-        yield from _each(2, BOTH, conditions[1], both)
+        yield (2, BOTH, conditions[1], both)
     if ddq is not None:
-        yield from _each(2, "accelerations", "", value_intervals(t, ddq, errors.ddq))
+        yield (2, "accelerations", "", value_intervals(t, ddq, errors.ddq))
         rates = first_derivatives(t, ddq, errors.ddq, errors.t)
-        yield from _each(3, "accelerations", "", rates)
-
-
-def _each(
-    order: int, samples: str, condition: str, found: Iterator[MeanDerivatives]
-) -> Iterator[tuple[int, str, str, MeanDerivatives]]:
-    return ((order, samples, condition, bounds) for bounds in found)
+        yield (3, "accelerations", "", rates)

@@ -34,7 +34,6 @@ from cnpgen.problems.problem import Problem
 from cnpgen.robots.robot import Robot
 from cnpgen.robots.scene import PARKED_POSITION_M, Scene
 from cnpgen.robots.shape.hull import CUBE
-from cnpgen.robots.solid import pose_width
 from cnpgen.world.forward_kinematics import ForwardKinematics
 from cnpgen.world.path import PathWorld
 
@@ -391,7 +390,7 @@ def _world(problem: Problem, scene: Scene) -> Iterator[Body]:
             )
     contact, table = problem.first(PuckContact), problem.first(Table)
     if table is not None:
-        values = scene.poses[0, problem.scene_width - len(problem.parameters) :]
+        values = scene.poses[0, problem.scene_columns.parameters]
         low, high = table.bounds_of(
             dict(zip(problem.parameters.names, values.tolist(), strict=True))
         )
@@ -400,7 +399,7 @@ def _world(problem: Problem, scene: Scene) -> Iterator[Body]:
         )
         yield wrapped("table", 0, _on_table(problem, scene, corners), 0.0)
     if contact is not None:
-        x, y = scene.poses[0, pose_width(scene.obstacles) :][2:4]
+        x, y = scene.poses[0, problem.scene_columns.constraint][2:4]
         if x < PUCK_OUT_OF_REACH_M:
             corners = _disc_corners(
                 np.array([x, y, table.z if table else 0.0]),
@@ -413,7 +412,7 @@ def _world(problem: Problem, scene: Scene) -> Iterator[Body]:
 def _on_table(problem: Problem, scene: Scene, corners: Array) -> Array:
     """Return corners in the frame of the table in the world frame [m], shape (V, 3)."""
     parameters = np.repeat(
-        scene.poses[:1, problem.scene_width - len(problem.parameters) :],
+        scene.poses[:1, problem.scene_columns.parameters],
         len(corners),
         axis=0,
     )

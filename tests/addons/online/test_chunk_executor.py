@@ -7,6 +7,7 @@ import numpy as np
 import pinocchio as pin
 import pytest
 
+from cnpgen.addons.online.chunk_checks import ChunkOptions
 from cnpgen.addons.online.chunk_executor import ChunkExecutor
 from cnpgen.addons.online.switches import SwitchOutcome
 from cnpgen.errors import UsageError
@@ -396,9 +397,8 @@ def test_a_chunk_that_comes_too_late_is_refused_and_nothing_stops(controller):
 
 def test_stop_after_shortens_the_motion():
     for stop_after in (0.5, 1.0):
-        control = Controller(
-            ChunkExecutor("panda-3kg", **OPTIONS, stop_after=stop_after)
-        )
+        options = ChunkOptions(stop_after=stop_after)
+        control = Controller(ChunkExecutor("panda-3kg", **OPTIONS, options=options))
         join = control.step(chunk(0.0))
         assert join.accepted
         assert 0.8 * stop_after < join.end_time - join.time <= stop_after
@@ -434,16 +434,20 @@ def test_wrong_options_and_shapes_are_refused(controller):
         ({"length": 7}, "length"),
         ({"length": 10**6}, "length"),
         ({"stale_after": 1e9}, "stale_after must be from"),
-        ({"stop_after": 0.1}, "stop_after must be at least 0.28 s"),
         (
             {"tracking_error": [0.1, 0.2]},
             "tracking_error must be one positive number or 7",
         ),
         ({"tracking_error": 0.0}, "tracking_error"),
-        ({"noise": 0.0}, "noise must be positive"),
     ):
         with pytest.raises(UsageError, match=text):
             ChunkExecutor("panda-3kg", **OPTIONS | change)
+    for options, text in (
+        ({"stop_after": 0.1}, "stop_after must be at least 0.28 s"),
+        ({"noise": 0.0}, "noise must be positive"),
+    ):
+        with pytest.raises(UsageError, match=text):
+            ChunkExecutor("panda-3kg", **OPTIONS, options=ChunkOptions(**options))
     still = (HOME, np.zeros(7))
     for values, measured, text in (
         (np.zeros((49, 7)), still, r"chunk must have shape \(50, D\)"),
@@ -493,8 +497,6 @@ def test_a_chunk_that_is_refused_does_not_fix_the_columns_and_large_values_are_o
     [
         {"tracking_error": np.inf},
         {"tracking_error": True},
-        {"stop_after": 1e308},
-        {"stop_after": True},
     ],
     ids=str,
 )
@@ -502,6 +504,30 @@ def test_options_that_disable_a_check_are_refused(wrong):
     with pytest.raises(UsageError) as raised:
         ChunkExecutor("panda-3kg", **{**OPTIONS, **wrong})
     assert raised.value.argument in wrong
+
+
+@pytest.mark.parametrize("wrong", [1e308, True, -1.0], ids=str)
+def test_times_to_rest_that_disable_the_check_are_refused(wrong):
+    with pytest.raises(UsageError, match="stop_after"):
+        ChunkExecutor("panda-3kg", **OPTIONS, options=ChunkOptions(stop_after=wrong))
+
+
+def test_future_set_points_are_those_that_are_served_later():
+    # The join is at none of the times.
+    controller = Controller(ChunkExecutor("panda-3kg", **OPTIONS | {"join": 0.055}))
+    values = chunk(0.0)
+    assert controller.step(values).accepted
+    values[:] = np.nan  # the caller may reuse the array
+    times = controller.time + np.arange(1, 100) * 0.01
+    planned = [controller.executor.state_at(time) for time in times]
+    controller.run(0.99)
+    for before, served in zip(planned, controller.points[-99:], strict=True):
+        for a, b in zip(before, served, strict=True):
+            np.testing.assert_allclose(a, b, atol=1e-12)
+    with pytest.raises(UsageError, match="kept motions begin"):
+        controller.executor.state_at(times[-1] - 30.0)
+    with pytest.raises(UsageError, match="waits for reset"):
+        ChunkExecutor("panda-3kg", **OPTIONS).state_at(0.0)
 
 
 def test_measured_positions_outside_the_limits_are_refused():

@@ -459,7 +459,7 @@ def test_options_that_no_scene_needs_are_named(
     (scene,) = load_scenes(file, present=present)
     assert scene.start_q.tolist() == [0.3, 0.4]
     assert not caplog.text
-    with pytest.raises(UsageError, match="no such folder of packages"):
+    with pytest.raises(UsageError, match="must be folders, there is no"):
         load_scenes(file, packages=[tmp_path / "none"])
 
 

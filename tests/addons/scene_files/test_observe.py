@@ -1,11 +1,13 @@
 """Observations of scenes: compiled code against NumPy, Coal and geometry."""
 
 from collections.abc import Callable
+from pathlib import Path
 
 import numpy as np
 import pytest
 
-from cnpgen.errors import UsageError
+from cnpgen.errors import MachineError, UsageError
+from cnpgen.kernels import c_library
 from cnpgen.kernels.observation.compiled_observations import observation_backend
 from cnpgen.loader.batch import Batch
 from cnpgen.loader.batch_options import BatchOptions
@@ -168,6 +170,15 @@ def test_distances_agree_with_coal() -> None:
             )
             smallest = min(smallest, result.min_distance + 1e-6)
         assert distance == pytest.approx(smallest, abs=5e-6)
+
+
+def test_without_compiled_code_the_error_names_the_compiler(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, fresh_compiler: None
+) -> None:
+    monkeypatch.setattr(c_library, "BUILT_FOLDER", tmp_path / "none")
+    monkeypatch.setenv("CC", "no-such-compiler")
+    with pytest.raises(MachineError, match="observe is missing: no C compiler found"):
+        observe(scenes(), "cloud")
 
 
 def test_a_camera_sees_the_nearest_surface_only() -> None:

@@ -14,6 +14,10 @@ pyarrow = pytest.importorskip("pyarrow")
 parquet = pytest.importorskip("pyarrow.parquet")
 
 FPS = 30
+COMMON_ARMS = (
+    *("panda", "fr3", "ur3e", "ur5e", "ur10e", "ur16e", "ur20", "xarm6", "xarm7"),
+    *("iiwa7", "iiwa14", "kinova_gen3", "viperx", "so100_follower", "so101"),
+)
 SO_JOINTS = ("shoulder_pan", "shoulder_lift", "elbow_flex", "wrist_flex", "wrist_roll")
 STEP = 2 * np.pi / 4096
 
@@ -91,7 +95,7 @@ def check(capsys: pytest.CaptureFixture[str], *words: Any) -> tuple[int, Any]:
 
 def jumped(q: np.ndarray) -> np.ndarray:
     q = q.copy()
-    q[90, 1] += 1.0
+    q[90, 1] += 2.0
     return q
 
 
@@ -169,7 +173,7 @@ def test_rounding_alone_is_for_review_and_a_stated_noise_excludes(
 ) -> None:
     arm = find_arm("panda")
     q = motion(3, joints=7) + np.array([0, 0, 0, -1.5, 0, 1.8, 0])
-    q[60, 0] += 0.5
+    q[60, 0] += 0.8
     folder = write_lerobot(tmp_path / "set", [q], robot="franka", names=arm.joints)
     code, found = check(capsys, folder)
     assert (code, found["episodes"][0]["result"]) == (0, "REVIEW")
@@ -179,6 +183,24 @@ def test_rounding_alone_is_for_review_and_a_stated_noise_excludes(
     levels = {f["check"]: f["level"] for f in found["episodes"][0]["findings"]}
     assert levels["velocity"] == "EXCLUDE"
     assert levels.get("acceleration", "REVIEW") == "REVIEW"
+
+
+def test_a_step_that_a_late_frame_explains_is_for_review(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    q = motion(0)
+    q[90:, 1] += (
+        0.6  # 18 rad/s by the nominal times, 2.4 rad/s with a frame that is late
+    )
+    t = np.arange(len(q)) / FPS + np.random.default_rng(0).uniform(0, 1e-3, len(q))
+    for times, result in ((None, "REVIEW"), ([t], "EXCLUDE")):
+        folder = write_lerobot(tmp_path / result, [q], times=times)
+        _, found = check(capsys, folder, "--unit", "rad")
+        assert found["episodes"][0]["result"] == result
+    _, found = check(
+        capsys, tmp_path / "REVIEW", "--unit", "rad", "--time-jitter", "0.01"
+    )
+    assert found["episodes"][0]["result"] == "EXCLUDE"  # by a stated jitter
 
 
 def test_actions_never_exclude_for_their_derivatives(
@@ -355,3 +377,12 @@ def test_healthy_recordings_of_a_simulated_arm_are_never_excluded(
     code, found = check(capsys, folder, "--unit", "rad")
     assert code == 0, found
     assert found["counts"]["EXCLUDE"] == 0
+
+
+@pytest.mark.parametrize("name", COMMON_ARMS)
+def test_all_common_arms_are_known_and_limit_velocities(name: str) -> None:
+    arm = find_arm(name)
+    limit = arm.limits["velocity"]
+    # Outside, a unit was mistaken.
+    assert (limit.upper > 1.2).all()
+    assert (limit.upper < 7).all()
