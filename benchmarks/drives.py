@@ -6,8 +6,9 @@ and by MuJoCo's inverse dynamics with armature and damping (its dry friction is 
 a reversal, so it is added as c sign(dq)). A plan exceeds a limit above 1.005 of it, the tolerance of the problems. Columns
 "motor" count motor torques with the exact law, "no friction" those without friction, "joint" torques at the joint.
 Other plants have a Stribeck law and drives that differ by up to 30 % (benchmarks/drive_plant.py); some plans are also
-executed there. The CPU time of solving is that of batches in alternation, with compiled kernels; that of planning is of
-the shipped planner of the drives, in alternation with the same planner without [drive].
+executed there, and problems are solved with the plant's breakaway friction and errors, as a margin. The CPU time of
+solving is that of batches in alternation, with compiled kernels. That of planning 1,024 problems is of a shipped planner
+with these drives and without: heavy-object-drive, and panda-scenes, whose problem has free jerks and goal accelerations.
 
     python benchmarks/drives.py
     python benchmarks/drives.py --problems 40 --executed 10
@@ -23,7 +24,7 @@ from typing import Any
 
 import numpy as np
 from common import arguments, cpu_of, median, progress, report, table
-from drive_plant import execute, torque_errors
+from drive_plant import STRIBECK_RATIO, execute, torque_errors
 from scipy.spatial.transform import Rotation
 
 import cnpgen
@@ -38,12 +39,16 @@ from cnpgen.refine.refine_plans import solve_plans
 from cnpgen.robots.drive import Drive
 from cnpgen.robots.robot import Robot
 
-PIPELINES = ("heavy-object-drive", "panda-scenes-drive")
+# Pipelines with drives, and planners to which these drives are given.
+PLANNERS = {
+    "heavy-object-drive": "heavy-object-drive",
+    "panda-scenes-drive": "panda-scenes",
+}
 PHASES = 2001  # of every plan
 TOLERANCE = 1.005  # of a limit
 ERRORS = (-0.3, -0.15, 0.0, 0.15, 0.3)  # of rotors and friction of other plants
 BATCH = 30  # problems that are solved at a time
-MODEL, PLANNED = "heavy-object-drive", 1024  # planner, and problems in a batch
+PLANNED = 1024  # problems in a batch
 MOTIONS, CALLS, SLOWER = 512, 9, 0.8  # of the time parametrization; factor of rates
 MOVING = 1e-9  # rad/s, above which dry friction has a direction
 
@@ -56,6 +61,11 @@ class States:
     dq: np.ndarray
     ddq: np.ndarray
     duration: np.ndarray  # shape (N,)
+
+    @property
+    def sign(self) -> np.ndarray:
+        """Directions of dry friction, zero at rest."""
+        return np.asarray(np.sign(self.dq) * (np.abs(self.dq) > MOVING))
 
 
 def states_of(plans: Plans) -> States:
@@ -130,7 +140,7 @@ def exceeding(torque: np.ndarray, limit: np.ndarray) -> dict[str, Any]:
 def judge(plans: Plans, drive: Drive, robot: Robot) -> dict[str, Any]:
     """Count the plans whose torques exceed a limit, by both judges and on another plant."""
     states = states_of(plans)
-    sign = np.sign(states.dq) * (np.abs(states.dq) > MOVING)
+    sign = states.sign
     b, c, limit = drive.viscous, drive.coulomb, drive.torque_limit
     rotors = along(pinocchio_torque(robot, drive.armature), states)
     smooth = rotors + b * states.dq
@@ -151,12 +161,13 @@ def judge(plans: Plans, drive: Drive, robot: Robot) -> dict[str, Any]:
     }
 
 
-def without_drive(problems: Plans) -> Plans:
-    """Return the same boundary problems of the rigid robot."""
+def with_drive(problems: Plans, drive: dict[str, Any] | None) -> Plans:
+    """Return the same boundary problems of the robot with these drives, or of the rigid robot."""
     record = problems.problem
     content = {key: value for key, value in record.content.items() if key != "drive"}
-    rigid = ProblemRecord(json.dumps(content, ensure_ascii=False), record.urdf)
-    return replace(problems, problem=rigid)
+    content |= {"drive": drive} if drive else {}
+    text = json.dumps(content, ensure_ascii=False)
+    return replace(problems, problem=ProblemRecord(text, record.urdf))
 
 
 def solve_alternately(
@@ -178,21 +189,22 @@ def solve_alternately(
     return {key: concatenate(each) for key, each in parts.items()}, cpu
 
 
-def planning() -> dict[str, Any]:
+def planning(name: str, drive: dict[str, Any]) -> dict[str, Any]:
     """Return the CPU times of planning a batch with and without drives, by the same planner [s]."""
-    model = load_model(MODEL)
-    problems = draw_boundary_problems(MODEL, PLANNED, seed=17)
-    sets = {"drives": problems, "rigid": without_drive(problems)}
-    planners = {
-        key: cnpgen.Planner(replace(model, problem=each.problem))
-        for key, each in sets.items()
-    }
+    model = load_model(PLANNERS[name])
+    problems = draw_boundary_problems(PLANNERS[name], PLANNED, seed=17)
+    sets = {"drives": drive, "rigid": None}
+    calls = {}
+    for key, each in sets.items():
+        record = with_drive(problems, each).problem
+        planner = cnpgen.Planner(replace(model, problem=record))
+        batch = partial(planner.plan_batch, columns=problems.columns)
+        calls[key] = partial(batch, problems.boundary)
+        calls[key]()  # compiles
     cpu: dict[str, list[float]] = {key: [] for key in sets}
-    for _ in range(1 + 3 * CALLS):
-        for key, each in sets.items():
-            planner = planners[key]
-            cpu[key].append(cpu_of(partial(planner.plan_batch, each.boundary)))
-    cpu = {key: each[1:] for key, each in cpu.items()}  # the first call compiles
+    for _ in range(3 * CALLS):
+        for key, call in calls.items():
+            cpu[key].append(cpu_of(call))
     pairs = zip(cpu["drives"], cpu["rigid"], strict=True)
     return {"CPU [s]": cpu, "CPU ratio": median([x / y for x, y in pairs])}
 
@@ -206,6 +218,33 @@ def executions(plans: Plans, robot: Robot, drive: Drive) -> dict[str, Any]:
             "plans": sum(each.use > TOLERANCE for each in runs),
             "largest": max(each.use for each in runs),
             "away [rad]": max(each.error for each in runs),
+        }
+    return found
+
+
+def margins(plans: Plans, robot: Robot, drive: Drive) -> dict[str, Any]:
+    """Solve the problems of plans with the breakaway friction of a plant and drives as large as its, and judge on it."""
+    stated, found = plans.problem.content["drive"], {}
+    for error in (each for each in ERRORS if each >= 0):
+        factors = dict.fromkeys(("armature", "rotor_inertia", "viscous"), 1 + error)
+        factors["coulomb"] = (1 + error) * STRIBECK_RATIO
+        larger = {
+            key: np.multiply(stated[key], factor).tolist()
+            for key, factor in factors.items()
+            if key in stated
+        }
+        solved = solve_plans(with_drive(plans, stated | larger), workers=1).plans
+        valid = cnpgen.evaluate_plans(solved, workers=1).valid
+        states = states_of(solved[np.flatnonzero(valid)])
+        joint = along(pinocchio_torque(robot, 0 * drive.armature), states)
+        moving = states.dq, states.ddq, states.sign
+        other = torque_errors(joint, moving, drive, (error,))[error]
+        found[f"{error:+.0%}"] = {
+            **exceeding(other, drive.torque_limit),
+            "valid": int(valid.sum()),
+            "duration ratio": float(
+                solved.duration[valid].mean() / plans.duration[valid].mean()
+            ),
         }
     return found
 
@@ -239,7 +278,7 @@ def measure(name: str, options: argparse.Namespace) -> dict[str, Any]:
     problems = draw_boundary_problems(name, options.problems, seed=options.seed)
     _, robot = open_problem(problems.problem)
     assert robot.drive is not None
-    sets = {"rigid": without_drive(problems), "drives": problems}
+    sets = {"rigid": with_drive(problems, None), "drives": problems}
     solved, cpu = solve_alternately(sets)
     valid = {
         key: cnpgen.evaluate_plans(each, workers=1).valid
@@ -260,12 +299,14 @@ def measure(name: str, options: argparse.Namespace) -> dict[str, Any]:
         },
         "CPU ratio": sum(cpu["drives"]) / sum(cpu["rigid"]),
         "CPU [s]": cpu,
+        "planning": planning(name, problems.problem.content["drive"]),
         "time parametrization [us]": parametrization_us(solved),
         "executed": executions(
             solved["drives"][np.flatnonzero(valid["drives"])[: options.executed]],
             robot,
             robot.drive,
         ),
+        "margins": margins(solved["drives"][: options.executed], robot, robot.drive),
         **{
             key: judge(each[np.flatnonzero(valid[key])], robot.drive, robot)
             for key, each in solved.items()
@@ -291,6 +332,7 @@ def tables(results: dict[str, dict[str, Any]]) -> list[str]:
                 for c in ("mean", "median", "largest")
             ),
             f"{found['CPU ratio']:.2f}",
+            f"{found['planning']['CPU ratio']:.2f}",
             _fitting(found["time parametrization [us]"]),
             f"{found['drives']['difference of judges [N m]']:.1e}",
         ]
@@ -306,6 +348,17 @@ def tables(results: dict[str, dict[str, Any]]) -> list[str]:
         for name, found in results.items()
         for error, each in found["executed"].items()
     ]
+    larger = [
+        [
+            name,
+            error,
+            _counted(each),
+            f"{each['valid']}",
+            f"{each['duration ratio']:.4f}",
+        ]
+        for name, found in results.items()
+        for error, each in found["margins"].items()
+    ]
     rates = [
         [
             name,
@@ -315,7 +368,14 @@ def tables(results: dict[str, dict[str, Any]]) -> list[str]:
     ]
     title = "plans above 1.005 of a limit (largest torque / limit)"
     ratio = [
-        *("problem", "duration: mean", "median", "largest", "CPU of solving"),
+        *(
+            "problem",
+            "duration: mean",
+            "median",
+            "largest",
+            "CPU of solving",
+            "of planning",
+        ),
         *("time parametrization [us]", "judges differ [N m]"),
     ]
     return [
@@ -331,6 +391,11 @@ def tables(results: dict[str, dict[str, Any]]) -> list[str]:
             "executed on other plants with late and limited currents",
             ["problem", "error", "above 1.005", "away [rad]"],
             executed,
+        ),
+        table(
+            "solved with the breakaway friction and the errors of the plant",
+            ["problem", "error", "above 1.005", "valid", "duration / without"],
+            larger,
         ),
         table(
             "largest rate of motor torques by joint [N m/s]",
@@ -358,19 +423,11 @@ def main() -> None:
         parser.add_argument("--problems", type=int, default=300)
         parser.add_argument("--seed", type=int, default=11)
         parser.add_argument("--executed", type=int, default=40, help="plans to execute")
-        parser.add_argument("--sets", nargs="+", choices=PIPELINES, default=PIPELINES)
+        parser.add_argument("--sets", nargs="+", choices=PLANNERS, default=[*PLANNERS])
 
     options = arguments(__doc__, add)
     results = {name: measure(name, options) for name in options.sets}
-    planned = planning()
-    text = (
-        f"planning {PLANNED} problems with drives / rigid: {planned['CPU ratio']:.2f}"
-    )
-    report(
-        {**results, "planning": planned},
-        [*tables(results), text],
-        as_json=options.json,
-    )
+    report(results, tables(results), as_json=options.json)
 
 
 if __name__ == "__main__":

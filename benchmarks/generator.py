@@ -4,7 +4,7 @@ The clock is the process's CPU time, so that other processes have little influen
 cases in turn. Rates are medians over the repetitions, ratios are medians of the ratios within one repetition.
 
     python benchmarks/generator.py
-    python benchmarks/generator.py --backend compiled numpy casadi --repeat 3
+    python benchmarks/generator.py --backend compiled numpy --repeat 3
 """
 
 import argparse
@@ -39,7 +39,7 @@ PIPELINES = (
     "panda-cup",
     "ur5-wipe",
 )
-BLOCKS = {"compiled": 16, "numpy": 4, "casadi": 1}  # per repetition
+BLOCKS = {"compiled": 16, "numpy": 4}  # per repetition
 TARGETS = {  # accepted rows per second and core
     ("airhockey-replan", "compiled"): 120_000,
     ("airhockey-replan", "numpy"): 12_000,

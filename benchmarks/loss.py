@@ -29,7 +29,6 @@ VARIANTS = (
     ("compiled", "float32"),
     ("compiled", "float64"),
     ("numpy", "float32"),
-    ("casadi", "float64"),
 )
 TARGET_US = 0.3  # per point of the gradient kernel in float32
 REFERENCE_NODES = 4096

@@ -57,11 +57,6 @@ class Suite:
             rows = list(
                 csv.DictReader(line for line in file if not line.startswith("#"))
             )
-        self._repeated = [
-            row
-            for row in rows
-            if row["planner"] in {r["planner"] for r in rows if r["repetition"] != "0"}
-        ]
         rows = [row for row in rows if row["repetition"] == "0"]
         names = {row["planner"] for row in rows if row["planned"] == "1"}
         self.planners = [name for name in ORDER if name in names]
@@ -74,37 +69,6 @@ class Suite:
             if plan not in plans:
                 plans.add(plan)
                 self._rows.setdefault((row["planner"], ANY_PLANT), []).append(row)
-
-    def repetitions(self) -> list[str]:
-        """Return a table of the successes of every repetition, on all plants; empty without repetitions."""
-        if not self._repeated:
-            return []
-        counts: dict[str, dict[str, dict[str, int]]] = {}
-        for row in self._repeated:
-            of_plant = counts.setdefault(row["planner"], {}).setdefault(
-                row["plant"], {}
-            )
-            of_plant[row["repetition"]] = of_plant.get(row["repetition"], 0) + (
-                row["success"] == "1"
-            )
-        most = max(
-            len(found) for of_plants in counts.values() for found in of_plants.values()
-        )
-        plants = [
-            plant
-            for plant in self.plants
-            if all(len(of.get(plant, {})) == most for of in counts.values())
-        ]
-        head = (
-            f"| {self.name}, successes of {most} repetitions | {' | '.join(plants)} |"
-        )
-        lines = [head, f"|{'---|' * (len(plants) + 1)}"]
-        for planner in (name for name in ORDER if name in counts):
-            cells = (
-                ", ".join(map(str, counts[planner][plant].values())) for plant in plants
-            )
-            lines.append(f"| `{planner}` | {' | '.join(cells)} |")
-        return ["\n".join(lines)]
 
     def rows(self, planner: str, plant: str = ANY_PLANT) -> Rows:
         """Return the rows of a planner on a plant; by default one row per problem, for what the plan alone determines.
@@ -196,101 +160,69 @@ PLANS: tuple[Column, ...] = (
     ("valid by the paper's rules", flag("paper_valid")),
 )
 TIME: Column = ("CPU time to plan: median, largest [ms]", planning_time)
-HITS: tuple[Column, ...] = (
-    ("time to hit [s]", median("hit_time_s", NOMINAL)),
-    ("puck speed [m/s]", median("puck_speed_m_s", NOMINAL)),
-    ("z error, planned [mm s]", median("planned_z_error_mm_s")),
-    ("z error, executed: median, largest [mm s]", extremes("z_error_mm_s", NOMINAL)),
-    ("height error: median, largest [mm]", extremes("plane_error_mm", NOMINAL)),
-    ("force on the table: median, largest [N]", extremes("table_force_n", NOMINAL)),
-    ("acceleration / limit: median, largest", extremes("acceleration_use")),
+HIT_TIME: Column = ("time to hit [s]", median("hit_time_s", NOMINAL))
+HEIGHT_ERROR: Column = (
+    "height error: median, largest [mm]",
+    extremes("plane_error_mm", NOMINAL),
 )
+MOTION_TIME: Column = ("motion time [s]", median("duration_s"))
 REPLANS: tuple[Column, ...] = (
     *PLANS,
     ("touched the puck early", flag("touched_early", NOMINAL)),
     ("success", flag("success", NOMINAL)),
-    ("95 % interval [%]", interval("success", NOMINAL)),
     TIME,
-    HITS[0],
-    HITS[4],
+    HIT_TIME,
+    HEIGHT_ERROR,
 )
-TABLES: dict[str, tuple[tuple[Column, ...], ...]] = {
+TABLES: dict[str, tuple[Column, ...]] = {
     "hits-81": (
-        (
-            *PLANS,
-            ("success: nominal", flag("success", NOMINAL)),
-            ("heavier", flag("success", "heavier")),
-            ("delayed", flag("success", "delayed")),
-            ("Challenge", flag("success", CHALLENGE)),
-            ("95 % interval, Challenge [%]", interval("success", CHALLENGE)),
-            TIME,
-        ),
-        (
-            ("scored: nominal, Challenge", pair("scored", (NOMINAL, CHALLENGE))),
-            ("touched the puck early", pair("touched_early", (NOMINAL, CHALLENGE))),
-            ("violated a constraint, Challenge", flag("violated", CHALLENGE)),
-            ("puck speed, Challenge [m/s]", median("puck_speed_m_s", CHALLENGE)),
-            (
-                "height error, Challenge: median, largest [mm]",
-                extremes("plane_error_mm", CHALLENGE),
-            ),
-        ),
-        HITS,
+        *PLANS,
+        ("success: nominal, Challenge", pair("success", (NOMINAL, CHALLENGE))),
+        ("95 % interval, Challenge [%]", interval("success", CHALLENGE)),
+        ("touched the puck early", flag("touched_early", CHALLENGE)),
+        TIME,
+        HIT_TIME,
+        ("puck speed [m/s]", median("puck_speed_m_s", NOMINAL)),
+        HEIGHT_ERROR,
     ),
     "hits-110": (
-        (
-            *PLANS,
-            ("scored", flag("scored", NOMINAL)),
-            ("success", flag("success", NOMINAL)),
-            TIME,
-            *HITS[:2],
-            HITS[3],
-            HITS[6],
-        ),
+        *PLANS,
+        ("success", flag("success", NOMINAL)),
+        TIME,
+        HIT_TIME,
+        HEIGHT_ERROR,
     ),
     "heavy-100": (
+        *PLANS,
+        ("at the goal, executed", flag("finished", NOMINAL)),
+        ("success", flag("success", NOMINAL)),
+        ("95 % interval [%]", interval("success", NOMINAL)),
+        TIME,
+        MOTION_TIME,
         (
-            *PLANS,
-            ("at the goal, executed", flag("finished", NOMINAL)),
-            ("success: nominal", flag("success", NOMINAL)),
-            ("heavier", flag("success", "heavier")),
-            ("delayed", flag("success", "delayed")),
-            ("95 % interval, nominal [%]", interval("success", NOMINAL)),
-            TIME,
-        ),
-        (
-            ("motion time [s]", median("duration_s")),
-            ("vertical error, planned [rad s]", median("planned_vertical_error_rad_s")),
-            (
-                "vertical error, executed [rad s]",
-                median("vertical_error_rad_s", NOMINAL),
-            ),
-            ("acceleration / limit: median, largest", extremes("acceleration_use")),
+            "vertical error, executed [rad s]",
+            median("vertical_error_rad_s", NOMINAL),
         ),
     ),
-    "replans-200": (REPLANS,),
-    "replan": (REPLANS,),
-    "online": (REPLANS,),
-    "clutter": (
-        (*PLANS[:2], TIME, ("motion time [s]", median("duration_s")), HITS[6]),
-    ),
+    "replans-200": REPLANS,
+    "replan": REPLANS,
+    "online": REPLANS,
+    "clutter": (*PLANS[:2], TIME, MOTION_TIME),
 }
 
 
-def tables(suite: Suite) -> list[str]:
-    """Return the Markdown tables of a suite: a row per planner."""
-    texts = []
-    for columns in TABLES[suite.name]:
-        lines = [
-            f"| {suite.name} | {' | '.join(text for text, _ in columns)} |",
-            f"|{'---|' * (len(columns) + 1)}",
-        ]
-        lines.extend(
-            f"| `{planner}` | {' | '.join(column(suite, planner) for _, column in columns)} |"
-            for planner in suite.planners
-        )
-        texts.append("\n".join(lines))
-    return texts + suite.repetitions()
+def table(suite: Suite) -> str:
+    """Return the Markdown table of a suite: a row per planner."""
+    columns = TABLES[suite.name]
+    lines = [
+        f"| {suite.name} | {' | '.join(text for text, _ in columns)} |",
+        f"|{'---|' * (len(columns) + 1)}",
+    ]
+    lines.extend(
+        f"| `{planner}` | {' | '.join(column(suite, planner) for _, column in columns)} |"
+        for planner in suite.planners
+    )
+    return "\n".join(lines)
 
 
 def archive(results: Path, folder: Path) -> None:
@@ -321,7 +253,7 @@ def main() -> None:
     for name in TABLES:
         path = given.folder / f"{name}.csv.gz"
         if path.exists():
-            print("\n\n".join(tables(Suite(path))), end="\n\n")
+            print(table(Suite(path)), end="\n\n")
 
 
 if __name__ == "__main__":

@@ -198,63 +198,41 @@ def fresh(sizes: dict[str, Any], options: argparse.Namespace) -> Result:
 
 
 def planned(sizes: dict[str, Any], options: argparse.Namespace) -> Result:
-    """Refine the plans of the shipped planners with the compiled and the NumPy backend."""
+    """Refine the plans of the shipped planners."""
     facts, rows = {}, []
     for name, count in zip(PIPELINES, sizes["planned"], strict=True):
         progress(f"{count} of {name}, planned")
         plans = Planner(name).plan_batch(
             draw_boundary_problems(name, count, seed=options.seed + 5).boundary
         )
-        compiled, numpy_results = (
-            make_each(plans, RefineOptions()),
-            make_each(plans, RefineOptions(), with_numpy(plans)),
-        )
+        results = make_each(plans, RefineOptions())
         center, p95 = (
             float(value)
-            for value in np.percentile([result.ms for result in compiled], [50, 95])
-        )
-        ratio = np.median(
-            [
-                a.duration / b.duration
-                for a, b in zip(compiled, numpy_results, strict=True)
-            ]
+            for value in np.percentile([result.ms for result in results], [50, 95])
         )
         targets = [
             verdict(value, goal, at_most=True)
             for value, goal in zip((center, p95), PLANNED_MS[name], strict=True)
         ]
-        valid = [
-            f"{np.mean([result.valid for result in results]):.2%}"
-            for results in (compiled, numpy_results)
-        ]
+        valid = f"{np.mean([result.valid for result in results]):.2%}"
         ms = (
             f"{center:.1f}",
             *targets[0],
             f"{p95:.1f}",
             *targets[1],
-            f"{median_verdict_ms(compiled):.1f}",
-            f"{median_ms(numpy_results):.1f}",
+            f"{median_verdict_ms(results):.1f}",
         )
-        rows.append((name, str(count), *ms, *valid, f"{ratio:.6f}"))
+        rows.append((name, str(count), *ms, valid))
         facts[name] = {
-            "ms": [result.ms for result in compiled],
-            "plain_ms": [result.ms for result in numpy_results],
+            "ms": [result.ms for result in results],
             "valid": valid,
         }
     head = (
-        "plans", "n", "median", "target", "", "p95", "target", "", "verdict", "median, NumPy", "valid",
-        "valid, NumPy", "T ratio",
+        "plans", "n", "median", "target", "", "p95", "target", "", "verdict", "valid",
     )  # fmt: skip
     return {"planned": facts}, [
         table("plans of the shipped planners, CPU time per plan [ms]", head, rows)
     ]
-
-
-def with_numpy(plans: Plans) -> Refiner:
-    """Return a refiner with compiled kernels and the NumPy backend."""
-    refiner = Refiner(*open_problem(plans.problem))
-    refiner.residual_kernels = replace(refiner.residual_kernels, step_library=None)
-    return refiner
 
 
 def ipopt(sizes: dict[str, Any], options: argparse.Namespace) -> Result:

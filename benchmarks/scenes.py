@@ -33,6 +33,7 @@ from cnpgen.kernels.collision.collision_checker import (
 )
 from cnpgen.kernels.collision.tree_search import TreeSettings, find_tree_path
 from cnpgen.kernels.library import KernelLibrary, choose_backend
+from cnpgen.pipelines.resting_states import RestingStates
 from cnpgen.plans.boundary_problems import plans_of_rows
 from cnpgen.plans.plans import Plans
 from cnpgen.plans.scene_plans import scene_plans
@@ -42,9 +43,8 @@ from cnpgen.problems.load_robot import load_robot
 from cnpgen.problems.problem import Problem
 from cnpgen.problems.problem_file import load_problem
 from cnpgen.problems.problem_record import as_problem, record_problem
-from cnpgen.refine.options import DEFAULT_OPTIONS
+from cnpgen.refine.options import DEFAULT_OPTIONS, RefineOptions
 from cnpgen.refine.refine_engine import prepare, refine_serially
-from cnpgen.refine.solver.hulls import Hulls
 from cnpgen.refine.task import Attempt
 from cnpgen.robots.obstacle import Obstacle
 from cnpgen.robots.robot import Robot
@@ -506,11 +506,18 @@ def boundary_columns(start: Array, goal: Array) -> dict[str, Array]:
     return columns | {"start_xyz": np.zeros((1, 3)), "goal_xyz": np.zeros((1, 3))}
 
 
-def solve_scene(problem: Problem, start: Array, goal: Array) -> Solved:
+def solve_scene(
+    problem: Problem,
+    start: Array,
+    goal: Array,
+    refine_options: RefineOptions = DEFAULT_OPTIONS,
+) -> Solved:
     """Solve a new scene."""
     columns = boundary_columns(start, goal)
     return solve_problem(
-        lambda: plans_of_rows(record_problem(problem), columns), problem.obstacle
+        lambda: plans_of_rows(record_problem(problem), columns),
+        problem.obstacle,
+        refine_options,
     )
 
 
@@ -525,14 +532,16 @@ def solve_suite(problem: Problem, count: int) -> list[Solved]:
 
 
 def solve_problem(
-    set_up: Callable[[], Plans], obstacles: tuple[Obstacle, ...]
+    set_up: Callable[[], Plans],
+    obstacles: tuple[Obstacle, ...],
+    refine_options: RefineOptions = DEFAULT_OPTIONS,
 ) -> Solved:
     """Set up one boundary problem and solve it; the CPU time includes both."""
     begun = time.process_time()
     plans = set_up()
     prepare(plans, DEFAULT_OPTIONS)
     ready = time.process_time()
-    (attempt,) = refine_serially(plans, DEFAULT_OPTIONS)
+    (attempt,) = refine_serially(plans, refine_options)
     return Solved(plans, attempt, obstacles, ready - begun, time.process_time() - begun)
 
 
@@ -653,16 +662,11 @@ def checks(states: int) -> dict[str, float]:
         if total > states:
             break
     recorded = np.concatenate(edges, axis=1)
-    hulls, poses = (
-        Hulls(base.with_obstacles(obstacles), robot),
-        place_obstacles(obstacles),
-    )
+    by_coal = RestingStates(base.with_obstacles(obstacles), robot)
     part = recorded[:, : states // 50]
     times = [median(cpu_of(lambda: checker.clear_states(recorded)) for _ in range(5))]
-    times.append(cpu_of(lambda: hulls.clear_states(part, poses)))
-    equal = bool(
-        np.array_equal(checker.clear_states(part), hulls.clear_states(part, poses))
-    )
+    times.append(cpu_of(lambda: by_coal.are_clear(part)))
+    equal = bool(np.array_equal(checker.clear_states(part), by_coal.are_clear(part)))
     close = cpu_of(
         lambda: [
             checker.close_bodies(recorded[:, :100], 0.04, of_obstacles=kind)

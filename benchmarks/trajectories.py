@@ -13,6 +13,10 @@ between the ends of the plans, and paths of the plans that TOPP-RA has timed (ex
     python benchmarks/trajectories.py hits.h5 --case "q dq ddq, 500 Hz" --case "q dq, 100 Hz"
     python benchmarks/trajectories.py hits.h5 --import --at-rest start
     python benchmarks/trajectories.py hits.h5 --import --stay-within 2
+
+With ``--formats``, plans are exported at 500 Hz in every format, read back and judged.
+
+    python benchmarks/trajectories.py hits.h5 --n 20 --formats
 """
 
 import argparse
@@ -28,6 +32,7 @@ from common import arguments, progress, report, table
 
 from cnpgen.addons.benchmark.planners.rrtconnect import timed_by_toppra
 from cnpgen.addons.benchmark.planners.ruckig import load_ruckig, time_optimal_motion
+from cnpgen.addons.trajectories.evaluate_trajectories import evaluate_trajectories
 from cnpgen.addons.trajectories.import_trajectories import import_trajectories
 from cnpgen.addons.trajectories.interpolate import bounded_jerk
 from cnpgen.addons.trajectories.judge_family import FamilyJudge
@@ -37,8 +42,9 @@ from cnpgen.addons.trajectories.sample_errors import SampleErrors
 from cnpgen.addons.trajectories.sampled_trajectory import Trajectory
 from cnpgen.addons.trajectories.trajectory_verdict import Decision, TrajectoryVerdict
 from cnpgen.judges.plans import Verdict
-from cnpgen.plans import Plans, load_plans, open_problem
+from cnpgen.plans import Plans, load_plans, open_problem, save_plans
 from cnpgen.plans.evaluate import evaluate_plans
+from cnpgen.plans.export import export_plans
 from cnpgen.plans.exporter import SampledPlan, sample_plan
 from cnpgen.refine.options import RefineOptions
 from cnpgen.refine.refine_plans import refine_plans
@@ -50,6 +56,17 @@ EXCESS = 0.01  # outside a limit with its tolerance, relative to the limit
 JERK_FACTOR = 1.01  # of the largest jerk of a plan: the stated bound
 PATH_POINTS = 100  # of the paths that TOPP-RA times
 JERK_SAMPLES = 20_000  # at which it is searched
+
+
+FORMATS = (
+    ("csv", "plans"),
+    ("npz", "plans.npz"),
+    ("parquet", "plans.parquet"),
+    ("joint-trajectory", "plans"),
+    ("ros2-control", "plans"),
+    ("lerobot", "plans"),  # float32
+)
+EXPORT_RATE_HZ = 500.0
 
 
 @dataclass(frozen=True)
@@ -329,6 +346,40 @@ def import_all(given: argparse.Namespace) -> None:
     report(results, [table("imported plans", head, rows, left=2)], as_json=given.json)
 
 
+def read_back(plans: Plans, to: str, name: str) -> int:
+    """Return how many exported plans are valid when they are read back."""
+    with tempfile.TemporaryDirectory() as folder:
+        out = Path(folder) / name
+        export_plans(plans, out, to=to, rate=EXPORT_RATE_HZ)
+        scenes = None
+        if OBSTACLE_POSES in plans.columns and to != "lerobot":
+            scenes = Path(folder) / "scenes.h5"
+            save_plans(scenes, plans)
+        loaded = load_trajectories(out, plans.problem, scenes=scenes)
+    trajectories = loaded.trajectories
+    values = plans.boundary.parameters
+    if values is not None:  # messages have no parameters
+        trajectories = tuple(
+            replace(each, parameters=row)
+            for each, row in zip(trajectories, values, strict=True)
+        )
+    return int(evaluate_trajectories(loaded.problem, trajectories).valid.sum())
+
+
+def export_all(given: argparse.Namespace) -> None:
+    """Export the plans of all files in all formats, and count those that are valid when read back."""
+    head = ("problem", "plans", *(to for to, _ in FORMATS))
+    rows = []
+    for file in given.files:
+        plans = load_plans(file)
+        plans = plans[np.flatnonzero(evaluate_plans(plans, workers=1).valid)[: given.n]]
+        counts = [str(read_back(plans, to, name)) for to, name in FORMATS]
+        rows.append((file.stem, str(len(plans)), *counts))
+        progress(f"{file}: {rows[-1]}")
+    results = {"rows": [dict(zip(head, row, strict=True)) for row in rows]}
+    report(results, [table("exported plans", head, rows, left=1)], as_json=given.json)
+
+
 def main() -> None:
     """Judge the plans of all files in all cases, or import them."""
 
@@ -347,6 +398,8 @@ def main() -> None:
             help="import and refine instead",
         )
 
+        text = "export the plans and read them back instead"
+        parser.add_argument("--formats", action="store_true", help=text)
         text = "end of imported motions at rest; both without a value"
         parser.add_argument(
             "--at-rest",
@@ -364,6 +417,9 @@ def main() -> None:
         )
 
     given = arguments(__doc__, add)
+    if given.formats:
+        export_all(given)
+        return
     import_all(given) if given.imports else judge_all(given)
 
 

@@ -6,7 +6,7 @@
 The source folder is the repository: links to SECURITY.md or to data cards work on the site and in the repository.
 The navigation follows the order of the links in index.md. Pages of the API are written before the build to
 reference/api/, and the pages that `cnpgen docs` makes from the code beside that folder; git ignores both. Notebooks of
-the tutorials are written to the folder notebooks of the site, interactive pages to the folder gallery.
+the tutorials are written to the folder notebooks of the site, interactive pages to the folders gallery and interactive.
 """
 
 import inspect
@@ -24,9 +24,14 @@ sys.path[:0] = [
 ]  # the package of this checkout; the scripts beside this file
 
 from gallery import CARDS, available, write_gallery  # noqa: E402
-from generate import BRIDGES, bridge_names, public_objects  # noqa: E402
 from notebooks import write_notebooks  # noqa: E402
+from planner_pages import write_pages  # noqa: E402
 
+from cnpgen.addons.manual.name_page import (  # noqa: E402
+    BRIDGES,
+    bridge_names,
+    public_objects,
+)
 from cnpgen.cli.docs_command import list_pages, page_text  # noqa: E402
 from cnpgen.machine.versions import DOCUMENTATION_URL, __version__  # noqa: E402
 
@@ -52,6 +57,7 @@ extensions = [
 ]
 copybutton_exclude = ".linenos, .gp"
 source_suffix = {".md": "markdown", ".rst": "restructuredtext"}
+myst_enable_extensions = ["attrs_block"]  # a class of a table
 myst_heading_anchors = 4  # the anchors of headings are GitHub's
 smartquotes = False  # they would change --n
 highlight_language = "none"  # blocks without a language
@@ -81,7 +87,7 @@ CAPTIONS = {
     "reference": "Reference",
     "benchmarks": "Benchmarks",
 }
-MADE = "cli", "keys"  # pages of the reference without a file in the repository
+MADE = "api", "cli", "keys"  # pages of the reference without a file in the repository
 OTHERS = (
     "README",
     "CHANGELOG",
@@ -105,6 +111,7 @@ def toctree(entries: list[str], *options: str) -> str:
 def add_navigation(_: Sphinx, docname: str, source: list[str]) -> None:
     """Append tables of contents to the pages that list others."""
     if docname == root_doc:
+        source[0] = source[0].replace("| your aim |", "{.cards}\n| your aim |")
         lists = source[0].partition("## Tutorials")[
             2
         ]  # the table above it repeats some links
@@ -134,6 +141,10 @@ def add_navigation(_: Sphinx, docname: str, source: list[str]) -> None:
         )
     if docname == "docs/how-to/gallery":
         source[0] = with_pages(source[0])
+    if docname == "docs/how-to/deploy" and find_spec("ziglang"):
+        link = r'<p><a href="../../interactive/\1.html">Open this page</a></p>'
+        pattern = r"<!-- page: (\w+) -->\n\n(!\[[^\]]*\]\([^)]*\))"
+        source[0] = re.sub(pattern, rf"\2\n\n{link}", source[0])
     if docname == "docs/reference/api":
         source[0] += toctree(["api/*"], ":glob:")
 
@@ -211,10 +222,12 @@ def escape_bars(
 
 
 def write_downloads(app: Sphinx, error: Exception | None) -> None:
-    """Write the notebooks into a site that was built."""
+    """Write the notebooks and the interactive pages into a site that was built."""
     if error is None and app.builder.name == "html":
         write_notebooks(Path(app.outdir) / "notebooks")
         write_gallery(Path(app.outdir) / "gallery")
+        if find_spec("ziglang"):
+            write_pages(Path(app.outdir) / "interactive")
 
 
 def setup(app: Sphinx) -> None:

@@ -20,11 +20,11 @@ CLIPS = {
     "heavy-object": 0,
     "clutter": 0,
 }  # recipe or page of the gallery -> problem
-SIZE = (400, 300)  # [pixels]
+SIZE = (800, 600)  # [pixels]
 FRAMES_PER_S = (
     25  # every second frame of a film of `cnpgen simulate`, which is four times slower
 )
-COLORS = 64
+COLORS = 256
 
 
 def solved_plan(clip: str, index: int) -> cnpgen.Plans:

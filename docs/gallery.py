@@ -36,8 +36,7 @@ CARDS = {
     "airhockey-replan": 3_000,
     "heavy-object": 3_000,
 }  # dataset -> rows of its picture
-PICTURE_SIZE = (900, 560)  # of a page in the browser [pixels]
-PICTURE_COLORS = 128
+PICTURE_SIZE = (1000, 620)  # of a page in the browser [pixels]
 CLUTTER = """
 [[obstacle]]
 name = "wall"
@@ -73,7 +72,7 @@ class Entry:
     Attributes:
         title: Title of the page.
         plans: Returns plans and their titles.
-        robots: Whether the extra ``robots`` is needed.
+        robots: Whether the extra ``robots`` is needed; its meshes are drawn.
         frame: Frame of the picture.
     """
 
@@ -167,7 +166,9 @@ def write_page(name: str, folder: Path) -> Path:
     plans, titles = ENTRIES[name].plans()
     problem, robot = open_problem(plans.problem)
     verdicts = cnpgen.evaluate_plans(plans, workers=1).verdicts
-    scene = scene_of_plans(problem, robot, plans, titles, verdicts, with_meshes=False)
+    scene = scene_of_plans(
+        problem, robot, plans, titles, verdicts, with_meshes=ENTRIES[name].robots
+    )
     path = folder / f"{name}.html"
     path.write_text(page_of(scene), encoding="utf-8")
     return path
@@ -223,10 +224,7 @@ def take_picture(page: Path, out: Path, frame: int) -> None:
             check=True,
             capture_output=True,
         )
-        picture = Image.open(shot).convert("RGB")
-    picture.quantize(
-        PICTURE_COLORS, Image.Quantize.MAXCOVERAGE, dither=Image.Dither.NONE
-    ).save(out, optimize=True)
+        Image.open(shot).convert("RGB").save(out, optimize=True)
 
 
 def main() -> None:

@@ -7,6 +7,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 from scipy.interpolate import BSpline
@@ -22,6 +23,7 @@ BLUE, RED, GRAY, GREEN = "#1f5fa8", "#c0392b", "#7f8c8d", "#2e8b57"
 START = np.array(
     [[-0.031, 0.728, -0.177, -0.573, -0.139, 1.590]]
 )  # on the table, as in the tutorial
+MAX_SPEED = 3.0  # [m/s] of the colours of paths
 GOAL = np.array([[0.025, 0.884, 0.185, -0.505, 0.112, 1.189]])
 
 
@@ -213,31 +215,32 @@ def draw_scenes() -> None:
 
 
 def draw_certification() -> None:
-    """Draw the tips of valid plans of certified samples, and the share of candidates after every stage."""
-    problems = cnpgen.draw_boundary_problems("airhockey-replan", 60, seed=3)
+    """Draw the paths of the tip of valid plans of certified samples, coloured by their speed."""
+    problems = cnpgen.draw_boundary_problems("airhockey-replan", 14, seed=3)
     refinement = cnpgen.solve_plans(problems, workers=1)
-    robot, s = cnpgen.RobotModel("airhockey"), np.linspace(0, 1, 60)
-    drawn = figure(6.0, 4.4)
+    assert refinement.valid.all()
+    robot, s = cnpgen.RobotModel("airhockey"), np.linspace(0, 1, 80)
+    states, times = refinement.plans.motion.at(s), refinement.plans.motion.time_at(s)
+    drawn = figure(5.4, 4.2)
     axes = drawn.subplots(1, 1)
-    for plan, valid in enumerate(refinement.valid):
-        q = refinement.plans.motion.at(s).q[plan]
-        x, y, _ = robot.forward_kinematics(q)[0].T
-        axes.plot(x, y, color=BLUE if valid else RED, linewidth=0.7)
-        axes.plot(x[0], y[0], "o", color=BLUE, markersize=2.5)
-        axes.annotate(
-            "",
-            (x[-1], y[-1]),
-            (x[-3], y[-3]),
-            arrowprops={"arrowstyle": "->", "color": BLUE, "lw": 0.7},
+    for plan in range(len(refinement.valid)):
+        xy = robot.forward_kinematics(states.q[plan])[0][:, :2]
+        speed = np.linalg.norm(np.diff(xy, axis=0), axis=1) / np.diff(times[plan])
+        lines = LineCollection(
+            np.stack([xy[:-1], xy[1:]], axis=1),
+            array=speed,
+            clim=(0, MAX_SPEED),
+            cmap="viridis_r",
+            linewidths=1.8,
         )
+        axes.add_collection(lines)
+        axes.plot(*xy[0], "o", color=GRAY, markersize=4)
+        axes.annotate("", xy[-1], xy[-4], arrowprops={"arrowstyle": "-|>", "lw": 0.8})
     axes.add_patch(Rectangle((0.6, -0.45), 1.4, 0.9, fill=False, color=GRAY))
-    count = int(refinement.valid.sum())
     axes.set(
-        title=f"{count} of {len(refinement.valid)} problems with a valid plan: paths of the tip [m]"
+        xlabel="x [m]", ylabel="y [m]", xlim=(0.55, 1.4), ylim=(-0.5, 0.5), aspect=1
     )
-    axes.set(
-        xlabel="x", ylabel="y", xlim=(0.55, 1.45), ylim=(-0.5, 0.5), aspect="equal"
-    )
+    drawn.colorbar(lines, label="speed of the mallet [m/s]")
     save(drawn, "certification")
 
 

@@ -46,6 +46,7 @@ from cnpgen.pipelines.stages.stage import CandidateBatch
 from cnpgen.robots.robot import Robot
 from cnpgen.store.files.cache_folder import exclusive_lock, make_private_folder
 from cnpgen.store.layout import MANIFEST
+from tests.examples.casadi_kernels import CasadiLibrary
 from tests.measure_costs import function_of, read_costly
 
 SHIPPED = ("airhockey-hit", "airhockey-replan", "heavy-object")
@@ -90,10 +91,6 @@ def pytest_configure(config: pytest.Config) -> None:
         signal.getsignal(signal.SIGINT) is signal.SIG_IGN
     ):  # as shells start what runs in the background
         signal.signal(signal.SIGINT, signal.default_int_handler)
-    if find_compiler() is None:
-        config.addinivalue_line(
-            "filterwarnings", "ignore:.*runs in NumPy, which is slower:RuntimeWarning"
-        )
 
 
 @pytest.hookimpl(tryfirst=True)
@@ -167,10 +164,13 @@ def prepare(fastest: Backend, cache_folder: Path) -> Prepare:
 
 @pytest.fixture(scope="session")
 def kernels_of(cache_folder: Path) -> Callable[..., KernelLibrary]:
-    """Give the kernel library of a prepared pipeline's problem, for any backend."""
+    """Give the kernel library of a prepared pipeline's problem, for any backend and CasADi."""
 
-    def library(prepared: PreparedPipeline, backend: Backend) -> KernelLibrary:
-        return replace(prepared.context.kernels, backend=backend)
+    def library(prepared: PreparedPipeline, backend: str) -> KernelLibrary:
+        kernels = prepared.context.kernels
+        if backend == "casadi":
+            return CasadiLibrary(**vars(kernels))
+        return replace(kernels, backend=backend)
 
     return library
 

@@ -22,7 +22,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from cnpgen.cli import recipe_names
-from cnpgen.cli.parser import Parser, add_json
+from cnpgen.cli.parser import EXTRAPOLATE, Parser, add_json
 from cnpgen.errors import counted, listed
 
 if TYPE_CHECKING:
@@ -50,6 +50,7 @@ def add_options(parser: Parser) -> None:
         help="file of boundary problems to write, .h5",
     )
     option("--force", action="store_true", help="replace OUT")
+    option("--extrapolate", action="store_true", help=EXTRAPOLATE)
     add_json(parser)
 
 
@@ -59,7 +60,9 @@ def run(arguments: argparse.Namespace) -> int:
     from cnpgen.plans import save_plans
 
     check_free(arguments.out, force=arguments.force)
-    found = complete(arguments.pipeline, arguments.tasks)
+    found = complete(
+        arguments.pipeline, arguments.tasks, extrapolate=arguments.extrapolate
+    )
     if len(found.plans):
         save_plans(arguments.out, found.plans)
     if not arguments.quiet:

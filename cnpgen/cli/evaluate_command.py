@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from cnpgen.cli import recipe_names, values, verdict_text
-from cnpgen.cli.parser import Parser, add_json
+from cnpgen.cli.parser import EXTRAPOLATE, Parser, add_json
 from cnpgen.cli.terminal import Meter
 from cnpgen.errors import DatasetError, UsageError
 
@@ -32,6 +32,7 @@ def add_options(parser: Parser) -> None:
     )
     text = "the problem of the plans; its tolerances are used"
     option("--problem", metavar="NAME|FILE", type=recipe_names.problem, help=text)
+    option("--extrapolate", action="store_true", help=EXTRAPOLATE)
     text = "time between two samples (default: 1ms, at most 10ms)"
     option("--step", metavar="S", type=values.seconds, default=1e-3, help=text)
     text = "largest tracking error of the joints, such as 2deg: position limits, clearances and the manifold hold"
@@ -77,7 +78,9 @@ def run(arguments: argparse.Namespace) -> int:
 def _evaluate(arguments: argparse.Namespace) -> "Evaluation":
     from cnpgen.plans.evaluate import evaluate_plans
 
-    plans = recipe_names.read_plans(arguments.file, problem=arguments.problem)
+    plans = recipe_names.read_plans(
+        arguments.file, problem=arguments.problem, extrapolate=arguments.extrapolate
+    )
     if arguments.plan is not None and arguments.plan >= len(plans):
         raise UsageError(
             f"{arguments.file} has no plan {arguments.plan}: {len(plans)} plans are numbered from 0"

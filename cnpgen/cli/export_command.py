@@ -13,6 +13,7 @@ otherwise nothing is written.
 
 import argparse
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -27,7 +28,7 @@ if TYPE_CHECKING:
 
 DEFAULT_RATE_HZ = 1000.0
 MAX_LISTED_PLANS = 10  # invalid plans that are listed by number
-NO_OBSTACLES = "the output lacks the obstacles of the plans: only a problem with these obstacles judges it among them"
+NO_OBSTACLES = "the output lacks the obstacles of the plans: 'cnpgen evaluate OUT --problem P --scenes FILE' takes them"
 
 
 def add_options(parser: Parser) -> None:
@@ -68,6 +69,15 @@ def add_options(parser: Parser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
+    return export(arguments, _plans(arguments))
+
+
+def export(
+    arguments: argparse.Namespace,
+    plans: "Plans | JoinedPlans",
+    sources: Sequence[Path] = (),
+) -> int:
+    """Export plans, which also depend on files beside those that the options name."""
     from cnpgen.cli.finished import (
         content_sha256,
         is_finished,
@@ -78,7 +88,6 @@ def run(arguments: argparse.Namespace) -> int:
 
     exporter = load_exporter(arguments.to)
     rate = DEFAULT_RATE_HZ if arguments.rate is None else arguments.rate
-    plans = _plans(arguments)
     chosen, out = _chosen(plans, arguments), _place(arguments, exporter)
     target = _target(out, exporter)
     request = [
@@ -88,7 +97,7 @@ def run(arguments: argparse.Namespace) -> int:
         arguments.at,
         [
             content_sha256(file)
-            for file in (Path(arguments.file), *(arguments.join or ()))
+            for file in (Path(arguments.file), *(arguments.join or ()), *sources)
         ],
     ]
     if is_finished(target, request, force=arguments.force):
@@ -109,7 +118,10 @@ def run(arguments: argparse.Namespace) -> int:
         which = f"plan{'s' * (len(exported.invalid) > 1)} {listed(exported.invalid, MAX_LISTED_PLANS)}"
         text = f"not valid by their status ('cnpgen evaluate' reports why): {which}"
         print(f"cnpgen: warning: {text}", file=sys.stderr)
-    if open_problem(plans.problem)[0].has_sample_obstacles:
+    if (
+        not exporter.uses_environment
+        and open_problem(plans.problem)[0].has_sample_obstacles
+    ):
         print(f"cnpgen: note: {NO_OBSTACLES}", file=sys.stderr)
     of_all = (
         f" of {exported.count + len(exported.refused):,}" if exported.refused else ""

@@ -69,7 +69,7 @@ def add_options(parser: Parser) -> None:
     )
     option(
         "--backend",
-        choices=("compiled", "numpy", "casadi"),
+        choices=("compiled", "numpy"),
         help="kernel backend; default the fastest available",
     )
     option(

@@ -172,6 +172,11 @@ def add_engine(
     parser.add_argument("--address", metavar="A", help=text)
 
 
+EXTRAPOLATE = (
+    "allow parameters outside of their ranges; the problem of the result is marked"
+)
+
+
 def options_of(arguments: argparse.Namespace, *names: str) -> dict[str, Any]:
     """Return options of a command as keyword arguments."""
     return {name: getattr(arguments, name) for name in names}

@@ -185,14 +185,16 @@ def present_or_model(text: str) -> Path:
     return present(text)
 
 
-def read_plans(path: Path, *, problem: str | None = None) -> "Plans":
+def read_plans(
+    path: Path, *, problem: str | None = None, extrapolate: bool = False
+) -> "Plans":
     """Read the plans of a file, as ``cnpgen.load_plans`` does.
 
     Refuse files without plans.
     """
     from cnpgen.plans import load_plans
 
-    plans = load_plans(path, problem=problem)
+    plans = load_plans(path, problem=problem, extrapolate=extrapolate)
     if not len(plans):
         raise DatasetError(f"no plans in {path}")
     return plans

@@ -15,7 +15,15 @@ from typing import TYPE_CHECKING, Any
 
 from cnpgen.cli import recipe_names, values
 from cnpgen.cli.interruption import resumable
-from cnpgen.cli.parser import ENGINE, Options, Parser, add_engine, add_json, options_of
+from cnpgen.cli.parser import (
+    ENGINE,
+    EXTRAPOLATE,
+    Options,
+    Parser,
+    add_engine,
+    add_json,
+    options_of,
+)
 from cnpgen.cli.terminal import Meter
 from cnpgen.cli.verdict_text import checksum_text
 from cnpgen.errors import UsageError, counted
@@ -65,11 +73,14 @@ def add_options(parser: Parser) -> None:
     parser.add_argument(
         "--problem", metavar="NAME|FILE", type=recipe_names.problem, help=text
     )
+    parser.add_argument("--extrapolate", action="store_true", help=EXTRAPOLATE)
     add_refine_options(parser)
 
 
 def run(arguments: argparse.Namespace) -> int:
-    plans = recipe_names.read_plans(arguments.file, problem=arguments.problem)
+    plans = recipe_names.read_plans(
+        arguments.file, problem=arguments.problem, extrapolate=arguments.extrapolate
+    )
     out = arguments.out or arguments.file.with_name(f"{arguments.file.stem}-refined.h5")
     if not arguments.quiet:
         print(f"{arguments.file}: {checksum_text(plans)}", file=sys.stderr)
@@ -140,6 +151,8 @@ def refine_and_save(
     from cnpgen.refine.refine_plans import identity_of_run, refine_plans
 
     given = options_of(arguments, *REFINING)
+    # Of ``solve`` only.
+    given["time_limit"] = getattr(arguments, "time_limit", None)
     options = RefineOptions(
         **{name: value for name, value in given.items() if value is not None}
     )

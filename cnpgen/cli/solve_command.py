@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from cnpgen.cli import recipe_names, values
-from cnpgen.cli.parser import Parser, options_of, refuse
+from cnpgen.cli.parser import EXTRAPOLATE, Parser, options_of, refuse
 from cnpgen.cli.refine_command import (
     ALLOW_UNUSED,
     LARGE_ANGLES,
@@ -60,6 +60,8 @@ def add_options(parser: Parser) -> None:
     )
     text = "the problem of boundary conditions in HDF5; its tolerances are used"
     option("--problem", metavar="NAME|FILE", type=recipe_names.problem, help=text)
+    text = f"{EXTRAPOLATE}, in HDF5"
+    option("--extrapolate", action="store_true", default=None, help=text)
     text = "solve scenes with this problem of a robot, such as panda"
     option("--robot", metavar="NAME|FILE", type=recipe_names.problem, help=text)
     option("--allow-unused", metavar="KEY", action="append", help=ALLOW_UNUSED)
@@ -69,6 +71,12 @@ def add_options(parser: Parser) -> None:
         "present positions of the planned joints, for scenes whose start state is empty"
     )
     option("--start", metavar="Q1,Q2,...", type=values.positions, help=text)
+    text = "plan file with a plan for each scene, before obstacles or ends moved a little: initial guesses"
+    option("--initial-plans", metavar="FILE", type=Path, help=text)
+    text = (
+        "end motions in scenes with zero acceleration, so that another one may follow"
+    )
+    option("--smooth-stop", action="store_true", default=None, help=text)
     text = "folder with the packages of mesh files of scenes; may be repeated"
     option("--packages", metavar="FOLDER", type=Path, action="append", help=text)
     option(
@@ -78,6 +86,8 @@ def add_options(parser: Parser) -> None:
         type=Path,
         help="output file (default: DIR-plans.h5 or NAME-plans.h5)",
     )
+    text = "time per problem, such as 100ms, after which the first valid plan ends the search; 0: a first plan quickly"
+    option("--time-limit", metavar="SECONDS", type=values.time_limit, help=text)
     option("--allow-large-angles", action="store_true", help=LARGE_ANGLES)
     parser.epilog = f"{parser.epilog or ''}\n"
     add_refine_options(parser)
@@ -110,7 +120,7 @@ def _solve_scenes(arguments: argparse.Namespace, out: Path) -> int:
 
     refuse(
         arguments,
-        ["split", "seed", "problem"],
+        ["split", "seed", "problem", "extrapolate"],
         "--robot is for scenes, which have --first and --n",
     )
     problem = as_problem(arguments.robot)
@@ -129,18 +139,27 @@ def _solve_scenes(arguments: argparse.Namespace, out: Path) -> int:
             dict(zip(joints, positions, strict=False)),
         ),
     )
-    record = record_problem(problem)
+    record, initial = record_problem(problem), None
+    if arguments.initial_plans is not None:
+        initial = recipe_names.read_plans(arguments.initial_plans, problem=None)
     request = [
         # With the meshes, which other files may hold.
         joblib.hash(scenes),
         [record.recipe, record.urdf],
         options_of(arguments, "payload"),
+        *([] if initial is None else [joblib.hash(vars(initial.motion))]),
+        *(["smooth stop"] if arguments.smooth_stop else []),
     ]
 
     def solve(_: "Plans", **options: Any) -> "SolvedScenes":
         names = options.keys() & {"engine", "address", "begin"}
         own = {name: options.pop(name) for name in names}
-        run = SceneOptions(payload=arguments.payload, **own)
+        run = SceneOptions(
+            payload=arguments.payload,
+            initial=initial,
+            smooth_stop=bool(arguments.smooth_stop),
+            **own,
+        )
         return solve_scenes(problem, scenes, run=run, **options)
 
     return refine_and_save(
@@ -160,8 +179,16 @@ def _problems(arguments: argparse.Namespace) -> "Plans":
 
     refuse(
         arguments,
-        ["allow_unused", "payload", "start", "packages"],
-        "--allow-unused, --payload, --start and --packages are for scenes, which need --robot",
+        [
+            "allow_unused",
+            "payload",
+            "start",
+            "packages",
+            "initial_plans",
+            "smooth_stop",
+        ],
+        "--allow-unused, --payload, --start, --packages, --initial-plans and --smooth-stop are for scenes,"
+        " which need --robot",
     )
     what = Path(arguments.what)
     kind = file_kind(what)
@@ -190,8 +217,8 @@ def _rows(arguments: argparse.Namespace) -> "Plans":
     )
     refuse(
         arguments,
-        ["problem"],
-        "--problem is for boundary conditions in HDF5; a dataset contains its problem",
+        ["problem", "extrapolate"],
+        "--problem and --extrapolate are for boundary conditions in HDF5; a dataset contains its problem",
     )
     split = arguments.split or "validation"
     return load_boundary_problems(
@@ -216,6 +243,7 @@ def _conditions(arguments: argparse.Namespace) -> "Plans":
         arguments.what,
         problem=arguments.problem,
         allow_large_angles=arguments.allow_large_angles,
+        extrapolate=bool(arguments.extrapolate),
     )
     if not len(problems):
         raise DatasetError(f"no boundary conditions in {arguments.what}")
@@ -232,8 +260,8 @@ def _draws(arguments: argparse.Namespace) -> "Plans":
     refuse(arguments, ["split", "first"], of_rows)
     refuse(
         arguments,
-        ["problem"],
-        "--problem is for boundary conditions in HDF5; a recipe contains its problem",
+        ["problem", "extrapolate"],
+        "--problem and --extrapolate are for boundary conditions in HDF5; a recipe contains its problem",
     )
     if arguments.n is None:
         raise UsageError(

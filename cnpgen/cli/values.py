@@ -131,6 +131,11 @@ def seconds_with_unit(text: str) -> float:
     return time
 
 
+def time_limit(text: str) -> float:
+    """Read a time in s or with its unit, or 0."""
+    return 0.0 if text.strip() == "0" else seconds(text)
+
+
 def _quantity(unit: str, expected: str, text: str) -> float:
     """Read a number above 0, in SI or with its unit."""
     from cnpgen.schema.units import parse_number

@@ -64,7 +64,7 @@ def summary_text(file: Path, found: "Evaluation") -> str:
     tables = (
         (_reasons(found, summary), (1,)),
         (_figures(summary, _shown(found)), range(1, 7)),
-        (_margins(summary), (1, 2, 3, 5, 6)),
+        (_margins(summary), (1, 2, 3, 4, 6, 7)),
     )
     sections += [
         table(rows, indent="  ", right=tuple(right))
@@ -168,15 +168,17 @@ def _margins(summary: dict[str, Any]) -> list[tuple[str, ...]]:
 
 def margin_head(*first: str, item: str) -> tuple[str, ...]:
     """Return the head of a table with ``margin_cells``."""
-    return *first, "worst violation", "tolerance", "unit", item, "t [s]", "where"
+    return *first, "margin", "violation", "tolerance", "unit", item, "t [s]", "where"
 
 
 def margin_cells(margin: Mapping[str, Any], index: int) -> tuple[str, ...]:
-    """Format the violation, tolerance, unit, plan or trajectory, time and place of a margin as cells of a table."""
-    violation = "-" if margin["violation"] is None else f"{margin['violation']:.2e}"
+    """Format a margin, or the violation in its place, with tolerance, unit, index, time and place as cells of a table."""
+    violation = margin["violation"]
+    holds = violation is not None and violation <= 0
     at = "-" if margin["time"] is None else f"{margin['time']:.4f}"
     return (
-        violation,
+        f"{abs(violation):.2e}" if holds else "-",
+        "-" if violation is None or holds else f"{violation:.2e}",
         f"{margin['tolerance']:.1e}",
         margin["unit"],
         str(index),

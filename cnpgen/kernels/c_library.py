@@ -11,7 +11,6 @@ import logging
 import platform
 import shlex
 import tempfile
-import warnings
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass
@@ -131,10 +130,13 @@ def find_built(paths: Sequence[Path]) -> Path | None:
 
 
 @cache
-def load_library(paths: tuple[Path, ...], cache_folder: Path) -> ctypes.CDLL | None:
+def load_library(paths: tuple[Path, ...], cache_folder: Path) -> ctypes.CDLL:
     """Return the library of C source: that of the package, or else one from the cache.
 
-    It is compiled if the cache lacks it; the result is None, after a warning, if that fails.
+    It is compiled if the cache lacks it.
+
+    Raises:
+        MachineError: There is no library of the package, and the compilation fails.
     """
     if built := find_built(paths):
         # Of another C library than the one of this system.
@@ -143,12 +145,10 @@ def load_library(paths: tuple[Path, ...], cache_folder: Path) -> ctypes.CDLL | N
     try:
         return ctypes.CDLL(str(compile_source(paths, cache_folder)))
     except (MachineError, OSError) as error:
-        text = (
-            f"{error}; {paths[-1].stem} runs in NumPy, which is slower"
+        raise MachineError(
+            f"the compiled C code {paths[-1].stem} is missing: {error}"
             " ('cnpgen docs troubleshooting')"
-        )
-        warnings.warn(text, RuntimeWarning, stacklevel=3)
-        return None
+        ) from error
 
 
 def library_file_stem(name: str, source: str, compiler: str) -> str:

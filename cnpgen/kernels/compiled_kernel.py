@@ -95,7 +95,7 @@ class CompiledKernel(Kernel):
         return results
 
     @property
-    def address(self) -> int | None:
+    def address(self) -> int:
         """Address of the machine code; see ``Kernel``."""
         return self._address
 

@@ -147,7 +147,7 @@ def _run(
         except BaseException as error:
             _kill(process)
             if isinstance(error, subprocess.TimeoutExpired):
-                hint = "set CC to another compiler, or choose the NumPy backend"
+                hint = "set CC to another compiler"
                 raise MachineError(
                     f"the C compiler {compiler} took more than {seconds:g} s {purpose}: {hint}"
                 ) from error

@@ -1,7 +1,4 @@
-"""Kernels without a compiler: NumPy runs the tape, one operation at a time on blocks of lanes.
-
-Kernels that use CasADi's map are the reference in tests of the fast backends.
-"""
+"""Kernels without machine code: NumPy runs the tape, one operation at a time on blocks of lanes."""
 
 from collections.abc import Callable, Sequence
 from functools import partial
@@ -13,7 +10,6 @@ from cnpgen.arrays import Array
 from cnpgen.kernels.kernel import (
     GridKernel,
     Kernel,
-    axis_names,
     check_grid,
     evaluate_lanes,
 )
@@ -221,58 +217,3 @@ def _allocate(tape: Tape) -> tuple[int, list[Step]]:
         if last[k] == 0:
             free.append(row)
     return max(count, 1), program
-
-
-class MappedKernel(Kernel):
-    """An SX function evaluated lane by lane by CasADi's virtual machine."""
-
-    def __init__(self, tape: Tape, function: Any) -> None:
-        super().__init__(tape)
-        self._function = function
-
-    def __call__(self, *arguments: Array) -> list[Array]:
-        """Evaluate the batch; see ``Kernel``."""
-        widths = self.tape.outputs
-        return evaluate_lanes(
-            self.tape,
-            arguments,
-            lambda inputs, n: _map(self._function, inputs, n, widths),
-        )
-
-
-class MappedGridKernel(GridKernel):
-    """An SX function evaluated point by point by CasADi's virtual machine, always in float64."""
-
-    def __init__(self, tape: Tape, function: Any) -> None:
-        super().__init__(tape)
-        self._function = function
-
-    def __call__(self, *arguments: Array, out: Sequence[Array]) -> None:
-        """Evaluate the grid; see ``GridKernel``."""
-        nodes, lanes = check_grid(self.tape, self.grid, arguments, out)
-        points = []
-        for argument, axes in zip(arguments, self.grid.arguments, strict=True):
-            names = axis_names(axes)
-            shape = (
-                len(argument),
-                nodes if "nodes" in names else 1,
-                lanes if "lanes" in names else 1,
-            )
-            spread = np.broadcast_to(
-                argument.reshape(shape), (len(argument), nodes, lanes)
-            )
-            points.append(spread.reshape(len(argument), nodes * lanes))
-        results = _map(self._function, points, nodes * lanes, self.tape.outputs)
-        for result, values, axes in zip(out, results, self.grid.results, strict=True):
-            grid = values.reshape(len(values), nodes, lanes)
-            result[...] = grid if axes == "point" else result + grid.sum(axis=1)
-
-
-def _map(
-    function: Any, arguments: Sequence[Array], n: int, widths: Sequence[int]
-) -> list[Array]:
-    if n == 0:
-        return [np.empty((width, 0)) for width in widths]
-    results = function.map(n)(*arguments)
-    results = results if isinstance(results, tuple) else (results,)
-    return [np.ascontiguousarray(np.array(result)) for result in results]

@@ -1,7 +1,9 @@
 """The contracts of kernels: one SX function on a batch, with arrays of shape (width, N), or on a grid of nodes."""
 
+import ctypes
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -9,6 +11,12 @@ from numpy.typing import NDArray
 
 from cnpgen.arrays import Array
 from cnpgen.kernels.tape import Axes, GridSpec, Tape
+
+_ARRAYS = ctypes.POINTER(ctypes.POINTER(ctypes.c_double))
+# ``kernel`` of arrays.h.
+_C_KERNEL = ctypes.CFUNCTYPE(
+    None, ctypes.c_long, _ARRAYS, ctypes.POINTER(ctypes.c_long), _ARRAYS
+)
 
 
 class Kernel(ABC):
@@ -22,12 +30,27 @@ class Kernel(ABC):
         self.tape = tape
 
     @property
-    def address(self) -> int | None:
-        """Address of the machine code, for other compiled code.
+    def address(self) -> int:
+        """Address of a ``kernel`` of arrays.h, for compiled code: machine code, or a function that calls this object."""
+        address = ctypes.cast(self._called_from_c, ctypes.c_void_p).value
+        assert address is not None
+        return address
 
-        None if there is none.
-        """
-        return None
+    @cached_property
+    def _called_from_c(self) -> Any:
+        def run(n: int, inputs: Any, distances: Any, outputs: Any) -> None:
+            # Rows of an input are ``distance`` apart, those of an output n. An input of
+            # no rows may have no address.
+            arguments = [
+                np.ctypeslib.as_array(inputs[i], (width, distances[i]))[:, :n]
+                if width
+                else np.empty((0, n))
+                for i, width in enumerate(self.tape.inputs)
+            ]
+            for i, result in enumerate(self(*arguments)):
+                np.ctypeslib.as_array(outputs[i], result.shape)[:] = result
+
+        return _C_KERNEL(run)
 
     @abstractmethod
     def __call__(self, *arguments: Array) -> list[Array]:

@@ -17,13 +17,9 @@ import numpy as np
 from cnpgen.errors import MachineError, UsageError
 from cnpgen.kernels.c_library import ARRAYS, load_library
 from cnpgen.kernels.compiled_kernel import CompiledGridKernel, CompiledKernel
-from cnpgen.kernels.interpreted_kernel import (
-    InterpretedGridKernel,
-    InterpretedKernel,
-    MappedGridKernel,
-    MappedKernel,
-)
+from cnpgen.kernels.interpreted_kernel import InterpretedGridKernel, InterpretedKernel
 from cnpgen.kernels.kernel import GridKernel, Kernel
+from cnpgen.kernels.shipped_tapes import find_shipped
 from cnpgen.kernels.tape import CODES, Dtype, GridSpec, Loop, Tape, tape_from_function
 from cnpgen.schema import addons, registry
 from cnpgen.schema.registry import package_digest
@@ -38,8 +34,8 @@ from cnpgen.store.files.cache_folder import (
     usable_cache_folder,
 )
 
-Backend = Literal["compiled", "numpy", "casadi"]
-BACKENDS: tuple[Backend, ...] = ("compiled", "numpy", "casadi")
+Backend = Literal["compiled", "numpy"]
+BACKENDS: tuple[Backend, ...] = ("compiled", "numpy")
 PACKAGE_FOLDER = Path(__file__).parents[1]
 # Imported by builders of any package.
 BUILDER_PACKAGES = "robots", "kernels", "problems", "trajectory"
@@ -52,8 +48,7 @@ class KernelLibrary:
     """Loader of kernels for one robot and problem, which builds those that are not cached.
 
     Attributes:
-        backend: "compiled", "numpy" (interpreted tape) or "casadi" (CasADi's map; slow,
-            for reference).
+        backend: "compiled", or "numpy" (interpreted tape).
         cache_folder: Folder of cached tapes and libraries.
         identity: Digest of all ``arguments``.
         arguments: Objects passed to builders that have a parameter of that name (robot,
@@ -91,9 +86,6 @@ class KernelLibrary:
             parameters: Further JSON-able keyword arguments of the builder; part of the
                 cache key.
         """
-        if self.backend == "casadi":
-            function = self._build(builder, parameters)
-            return MappedKernel(tape_from_function(function, loop), function)
         tape = self._tape(builder, parameters, loop=loop)
         if self.backend == "numpy":
             return InterpretedKernel(tape)
@@ -108,24 +100,13 @@ class KernelLibrary:
         **parameters: Any,
     ) -> GridKernel:
         """Return the kernel that evaluates an SX function on a grid of nodes and lanes, in a type; see ``load``."""
-        if self.backend == "casadi":
-            function = self._build(builder, parameters)
-            return MappedGridKernel(
-                tape_from_function(function, grid=grid, dtype=dtype), function
-            )
         tape = self._tape(builder, parameters, grid=grid, dtype=dtype)
         if self.backend == "numpy":
             return InterpretedGridKernel(tape)
         return CompiledGridKernel(tape, self.cache_folder)
 
-    def load_source(self, *paths: Path) -> ctypes.CDLL | None:
-        """Return the library of C source that follows ``arrays.h``.
-
-        None if the backend is not "compiled", or, after a warning, if the package lacks the
-        library and there is no C compiler.
-        """
-        if self.backend != "compiled":
-            return None
+    def load_source(self, *paths: Path) -> ctypes.CDLL:
+        """Return the library of C source that follows ``arrays.h``, see ``load_library``."""
         return load_library((ARRAYS, *paths), self.cache_folder)
 
     def tape(self, builder: Callable[..., Any], **parameters: Any) -> Tape:
@@ -156,17 +137,16 @@ class KernelLibrary:
         identity = {
             "builder": f"{builder.__module__}.{builder.__qualname__}",
             "source": _source_digests(builder),
-            "versions": _versions(),
             "problem": self.identity,
             "loop": [loop.tolerance, loop.limit] if loop else None,
             "grid": [grid.arguments, grid.results] if grid else None,
             "dtype": dtype,
             "parameters": parameters,
         }
-        digest = hashlib.sha256(
-            json.dumps(identity, sort_keys=True).encode()
-        ).hexdigest()
-        name = f"{builder.__name__}-{digest[:24]}.npy"
+        # The tapes of the package do not depend on the installed CasADi.
+        if (tape := find_shipped(_key(builder, identity))) is not None:
+            return tape
+        name = f"{_key(builder, identity | {'versions': _versions()})}.npy"
         if (tape := self._cached(name)) is None:
             tape = tape_from_function(
                 self._build(builder, parameters), loop, grid=grid, dtype=dtype
@@ -196,6 +176,12 @@ class KernelLibrary:
             make_private_folder(path.parent)
             write_file(path, tape.to_bytes())
             make_read_only_for_others(path)
+
+
+def _key(builder: Callable[..., Any], identity: Mapping[str, Any]) -> str:
+    """Return the name of a tape: that of its builder and a digest of its identity."""
+    digest = hashlib.sha256(json.dumps(identity, sort_keys=True).encode()).hexdigest()
+    return f"{builder.__name__}-{digest[:24]}"
 
 
 @cache
@@ -286,13 +272,13 @@ def choose_backend(requested: str | None = None) -> tuple[Backend, Path]:
         UsageError: There is no such backend.
         MachineError: The requested backend does not work on this machine.
     """
-    if requested is not None and requested not in BACKENDS:
+    if requested not in {None, *BACKENDS}:
         raise UsageError(
             f"backend {requested!r} does not exist: expected one of {', '.join(BACKENDS)}",
             concerns="backend",
         )
     folder = usable_cache_folder(default_cache_folder())
-    if requested in {"numpy", "casadi"}:
+    if requested == "numpy":
         return requested, folder
     try:
         _try_generator(folder)

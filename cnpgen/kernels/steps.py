@@ -1,16 +1,14 @@
 """Arithmetic steps on vectors: what a tape becomes before it is machine code."""
 
-from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 COMMUTATIVE = {"add", "mul", "eq", "ne", "and", "or"}
 
 
-@dataclass(frozen=True)
-class ArithmeticStep:
-    """One operation on vectors.
+class ArithmeticStep(NamedTuple):
+    """One operation on vectors; a named tuple, since a kernel has thousands.
 
     Attributes:
         operation: Its name: an entry of ``llvm_text.TEMPLATES``, "constant", "input",

@@ -6,7 +6,8 @@ import numpy as np
 
 from cnpgen.arrays import AnyArray
 from cnpgen.errors import UsageError
-from cnpgen.kernels.collision.clearance_loss import load_clearance_loss
+from cnpgen.kernels.collision.clearance_loss import ClearanceLoss
+from cnpgen.kernels.collision.collision_checker import load_collision_library
 from cnpgen.kernels.library import KernelLibrary
 from cnpgen.losses.plan_batch import PlanBatch
 from cnpgen.losses.quadrature import BasisTable
@@ -29,7 +30,8 @@ class HullLoss:
 
     Raises:
         UsageError: The problem has no constraint ``robot-clearance``, or its robot no
-            link geometry.
+            link geometry, or too many joints.
+        MachineError: The compiled code is missing.
     """
 
     def __init__(
@@ -47,7 +49,8 @@ class HullLoss:
             )
         index = problem.constraint.index(constraint)
         inset = float(tightening[len(problem.constraint) + index])
-        self._problem, self._losses = problem, load_clearance_loss(kernels, robot)
+        self._problem = problem
+        self._losses = ClearanceLoss(load_collision_library(kernels), robot)
         # The task loss is the first one.
         self._term = 1 + index
         self._required = constraint.distance + TRAINING_DISTANCE_M + inset  # m

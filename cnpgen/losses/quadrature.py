@@ -17,7 +17,7 @@ from cnpgen.arrays import Array
 from cnpgen.errors import UsageError, nearest
 from cnpgen.schema.argument_types import checked_arguments
 from cnpgen.schema.arguments import integer
-from cnpgen.trajectory.spline import basis
+from cnpgen.trajectory.spline import basis_tables
 from cnpgen.trajectory.trajectory_spec import TrajectorySpec
 
 RULES = ("cosine", "gauss")
@@ -104,14 +104,7 @@ def basis_table(
 ) -> BasisTable:
     """Tabulate the basis of both splines at the nodes of ``quadrature``, with ``orders`` orders of p."""
     s, weights = quadrature(rule, nodes, shift)
-    path = [
-        basis(s, spec.path_control_points, spec.degree, order)
-        for order in range(orders)
-    ]
-    rate = [
-        basis(s, spec.rate_control_points, spec.degree, order)
-        for order in range(orders - 1)
-    ]
+    path, rate = basis_tables(spec, s, orders)
     return BasisTable(
         s,
         weights[None].astype(dtype),

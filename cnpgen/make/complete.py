@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 
@@ -22,7 +22,7 @@ from cnpgen.pipelines.stages.stage import Context, load_context
 from cnpgen.plans.boundary_problems import plans_of_rows
 from cnpgen.plans.plans import Plans
 from cnpgen.problems.problem import Problem
-from cnpgen.problems.problem_record import record_problem
+from cnpgen.problems.problem_record import extrapolated, record_problem
 from cnpgen.robots.plausible_values import UnitError, check_plausible
 from cnpgen.robots.robot import Robot
 from cnpgen.schema.argument_types import checked_arguments
@@ -68,6 +68,8 @@ def complete(
     recipe: str | Path | Pipeline | DatasetRecipe | Problem,
     table: str | Path | None = None,
     /,
+    *,
+    extrapolate: bool = False,
     **columns: ArrayLike,
 ) -> Completed:
     """Complete tasks: compute their missing columns with the stages of a pipeline, without random sampling.
@@ -93,6 +95,8 @@ def complete(
             or a loaded recipe.
         table: Path of a table of tasks, CSV or HDF5, in place of the columns; see
             'cnpgen docs tasks'.
+        extrapolate: Whether parameters may be outside of their ranges. The problem of
+            the plans then has wider ranges, and a name that ends with "-extrapolated".
         columns: Name of a dataset column -> values in SI units, shape (w,) for one task
             or (N, w); scalars have shape () or (N,). The value of one task applies to
             all.
@@ -122,7 +126,7 @@ def complete(
             given_fields(steps_of(pipeline), context),
             table_height(context) is not None,
         )
-        run = partial(_completed, pipeline, context)
+        run = partial(_completed, pipeline, context, extrapolate)
     if table is None:
         return run(columns)
     if columns:
@@ -140,8 +144,15 @@ def complete(
 
 
 def _completed(
-    pipeline: Pipeline, context: Context, columns: Mapping[str, ArrayLike]
+    pipeline: Pipeline,
+    context: Context,
+    extrapolate: bool,
+    columns: Mapping[str, ArrayLike],
 ) -> Completed:
+    if extrapolate and "parameters" in columns:
+        wider = extrapolated(pipeline.problem, columns["parameters"])
+        pipeline = replace(pipeline, problem=wider)
+        context = load_context(wider, *choose_backend(None))
     completion = Completion(pipeline, context, columns)
     given = _given(
         completion.given,

@@ -24,7 +24,7 @@ class GenerationOptions:
             cluster on this machine.
         dtype: Float type in which rows are stored and validated, "float64" or
             "float32".
-        backend: "compiled", "numpy" or "casadi"; default the fastest working one.
+        backend: "compiled" or "numpy"; default the fastest working one.
         model: Planner for the initial guesses of certification, which takes half the
             time; by default no initial guess. Plans are judged in the same way; they
             differ as local optima from different initial guesses differ.

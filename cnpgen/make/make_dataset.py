@@ -37,7 +37,7 @@ from cnpgen.store.workspace import check_place, find_workspace, open_workspace
 
 # Number of rows up to which a second process takes longer to start than it saves, per
 # backend.
-MAX_ROWS_OF_ONE_PROCESS = {"compiled": 200_000, "numpy": 20_000, "casadi": 5_000}
+MAX_ROWS_OF_ONE_PROCESS = {"compiled": 200_000, "numpy": 20_000}
 MAX_BLOCKS_PER_RUN = 8  # blocks of the shards that a worker generates in one run
 MIN_RUNS_PER_WORKER = 4  # given enough blocks, so that workers finish at similar times
 MAX_THREADS = 8  # that compare shards with their records

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cnpgen.arrays import Array
+from cnpgen.errors import UsageError, counted
 from cnpgen.machine.times import NO_TIME, Times
 from cnpgen.make.goal_poses import (
     MAX_GOAL_STATES,
@@ -48,7 +49,7 @@ from cnpgen.problems.scenes.scene_problem import (
 from cnpgen.refine.goal_options import Progress
 from cnpgen.refine.options import DEFAULT_OPTIONS, RefineOptions
 from cnpgen.refine.proof.explain import Explanation, Feasibility, explain_failure
-from cnpgen.refine.refine_plans import solve_plans
+from cnpgen.refine.refine_plans import refine_tasks
 from cnpgen.refine.refinement import Refinement
 from cnpgen.refine.task import Attempt
 from cnpgen.robots.robot import Robot
@@ -72,6 +73,10 @@ class SceneOptions:
         engine: Engine that runs the work, see ``refine_plans``.
         address: Address of the engine's cluster.
         begin: Called once before the first scene, with the number of scenes and 0.
+        initial: Earlier plans, one for each scene in their order, as initial guesses:
+            obstacles or ends may have moved a little since.
+        smooth_stop: Whether motions end with zero acceleration, so that ``join_plans``
+            accepts the next one.
 
     Raises:
         UsageError: A value has another type.
@@ -81,6 +86,8 @@ class SceneOptions:
     engine: str | None = None
     address: str | None = None
     begin: Callable[[int, int], None] | None = None
+    initial: Plans | None = None
+    smooth_stop: bool = False
 
     def __post_init__(self) -> None:
         check_fields(self)
@@ -193,6 +200,7 @@ def solve_scenes(
     check_scenes(scenes)
     loaded, scenes = as_problem(problem), [checked_scene(scene) for scene in scenes]
     robot = load_robot(loaded)
+    _check_initial(loaded, len(scenes), chosen.initial)
     placed = [placed_scene(scene, robot, start_state(scene, robot)) for scene in scenes]
     loaded, robot, scenes = requested_problem(
         loaded, robot, placed, payload=chosen.payload
@@ -210,9 +218,12 @@ def solve_scenes(
     for own, indices in _groups(scenes):
         file = None if journal is None else Path(f"{journal}.{len(journals)}")
         journals += [] if file is None else [file]
-        refinement = solve_plans(
-            _plans_of(
-                loaded, scenes, [(index, goals[index]) for index in indices], own
+        refinement = refine_tasks(
+            _adjusted(
+                _plans_of(
+                    loaded, scenes, [(index, goals[index]) for index in indices], own
+                ),
+                chosen,
             ),
             options=options,
             workers=workers,
@@ -235,6 +246,38 @@ def solve_scenes(
     for file in journals:
         file.unlink(missing_ok=True)
     return solved
+
+
+def _check_initial(problem: Problem, count: int, initial: Plans | None) -> None:
+    """Raise UsageError if initial plans do not fit the scenes or the robot."""
+    if initial is None:
+        return
+    joints = len(problem.robot.joints)
+    spec = problem.trajectory
+    expected = (count, spec.path_control_points, joints), (count, spec.rate_control_points)  # fmt: skip
+    actual = initial.path_control_points.shape, initial.rate_control_points.shape
+    if (*actual, initial.degree) != (*expected, spec.degree):
+        raise UsageError(
+            f"must have one plan for each of {counted(count, 'scene')}, with control points of"
+            f" shapes {expected[0]} and {expected[1]} and degree {spec.degree},"
+            f" got {actual[0]} and {actual[1]} of degree {initial.degree}",
+            argument="initial",
+        )
+
+
+def _adjusted(plans: Plans, run: SceneOptions) -> Plans:
+    """Return plans with the motions of the initial plans of their scenes, and with a smooth stop."""
+    if run.initial is not None:
+        rows = plans.sample_id
+        plans = replace(
+            plans,
+            path_control_points=run.initial.path_control_points[rows],
+            rate_control_points=run.initial.rate_control_points[rows],
+        )
+    if not run.smooth_stop:
+        return plans
+    zero = np.zeros_like(plans.boundary.goal_q)
+    return replace(plans, boundary=replace(plans.boundary, goal_ddq=zero))
 
 
 def _without_options(refinement: Refinement) -> Plans:
@@ -289,6 +332,8 @@ def _plans_of(
 
 def _goals(problem: Problem, robot: Robot, scene: SceneProblem, index: int) -> Array:
     """Return the goal states of a scene that are tried, in this order, shape (G, n), G > 0."""
+    if scene.goal_pose is not None:
+        _frame_of(robot, scene, scene.goal_pose)
     if scene.other_goal_poses:
         return _of_alternatives(problem, robot, scene, index)
     if not len(scene.goal_q):

@@ -24,7 +24,7 @@ from cnpgen.planner.expressions import (
 )
 from cnpgen.problems.problem import Problem
 from cnpgen.robots.robot import Robot
-from cnpgen.trajectory.spline import basis, chebyshev
+from cnpgen.trajectory.spline import basis_tables, chebyshev
 from cnpgen.trajectory.spline_motion import Motion, time_derivatives
 
 MAX_TIME_SCALE = 3.0  # motions that need more are not usable plans
@@ -80,20 +80,8 @@ def make_phase_grid(
     problem: Problem, kernels: KernelLibrary, intervals: int
 ) -> PhaseGrid:
     """Make the grid of one problem, with K - 1 intervals between its phases."""
-    spec, s, orders = problem.trajectory, chebyshev(intervals), problem.path_orders
-    path = np.stack(
-        [
-            basis(s, spec.path_control_points, spec.degree, order)
-            for order in range(orders)
-        ]
-    )
-    rate = np.stack(
-        [
-            basis(s, spec.rate_control_points, spec.degree, order)
-            for order in range(orders - 1)
-        ]
-    )
-    return PhaseGrid(kernels.load(speed_violation), path, rate)
+    tables = basis_tables(problem.trajectory, chebyshev(intervals), problem.path_orders)
+    return PhaseGrid(kernels.load(speed_violation), *map(np.stack, tables))
 
 
 @dataclass(frozen=True)

@@ -236,6 +236,7 @@ def load_boundary_problems(
     n: int | None = None,
     problem: Problem | StoredProblem | str | Path | None = None,
     allow_large_angles: bool = False,
+    extrapolate: bool = False,
 ) -> Plans:
     """Read boundary problems as plans without motions for ``solve_plans``: their control points are nan.
 
@@ -254,6 +255,8 @@ def load_boundary_problems(
             probably in degrees or millimetres.
         problem: Required problem of a file: name, path, problem or record. Its
             tolerances replace those in the file.
+        extrapolate: Whether parameters in a file may be outside of their ranges; see
+            ``load_plans``.
 
     Raises:
         DatasetError: The dataset or the file cannot be read, is incomplete or is of
@@ -274,6 +277,7 @@ def load_boundary_problems(
             path,
             None if problem is None else as_record(problem),
             allow_large_angles=allow_large_angles,
+            extrapolate=extrapolate,
         )
     require_folder(path, argument="path")
     if problem is not None:
@@ -335,7 +339,11 @@ def chosen_rows(
 
 
 def _of_file(
-    path: Path, wanted: ProblemRecord | None, *, allow_large_angles: bool
+    path: Path,
+    wanted: ProblemRecord | None,
+    *,
+    allow_large_angles: bool,
+    extrapolate: bool,
 ) -> Plans:
     """Return the boundary problems of a file."""
     file = read_boundary_file(path)
@@ -345,6 +353,7 @@ def _of_file(
         wanted,
         content="boundary problems",
         command="solve",
+        parameters=file.columns.get("parameters") if extrapolate else None,
     )
     if (
         recorded := file.text("problem_sha256")

@@ -124,7 +124,8 @@ def export_plans(
             f"{out} is a file, but {to!r} makes one file per plan: give a folder",
             concerns="out",
         )
-    problem, sampled = plans.problem, _sampled(plans, rate, kept)
+    problem = plans.problem
+    sampled = _sampled(plans, rate, kept, exporter.ticks_per_s)
     drive = open_problem(problem)[1].drive if "drive" in problem.content else None
     if drive is not None:
         sampled = _with_torques(sampled, plans, drive)
@@ -266,12 +267,12 @@ def _why_not(
 
 
 def _sampled(
-    plans: Plans | JoinedPlans, rate: float, kept: list[int]
+    plans: Plans | JoinedPlans, rate: float, kept: list[int], ticks_per_s: int | None
 ) -> Iterator[SampledPlan]:
     motion, parameters = plans.motion, _last(plans).boundary.parameters
     for index in kept:
         values = () if parameters is None else tuple(parameters[index].tolist())
-        yield sample_plan(motion[[index]], rate, index, values)
+        yield sample_plan(motion[[index]], rate, index, values, ticks_per_s)
 
 
 def _with_torques(

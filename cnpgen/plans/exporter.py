@@ -107,12 +107,15 @@ class Exporter(ABC):
             joints that are not planned.
         is_folder: Whether the output with all plans is a folder.
         uses_environment: Whether the format has goals, columns of the tasks and scenes.
+        ticks_per_s: Units of the format's times per second; None if they are floats.
+            Plans are sampled at the times that the file states.
     """
 
     suffix: ClassVar[str]
     single_file: ClassVar[bool] = False
     is_folder: ClassVar[bool] = False
     uses_environment: ClassVar[bool] = False
+    ticks_per_s: ClassVar[int | None] = None
 
     @abstractmethod
     def write(
@@ -136,11 +139,15 @@ def sample_plan(
     rate: float,
     index: int = 0,
     parameters: tuple[float, ...] = (),
+    ticks_per_s: int | None = None,
 ) -> SampledPlan:
-    """Sample one motion at ``rate`` [Hz], and at its last instant."""
+    """Sample one motion at ``rate`` [Hz], and at its last instant, or the last tick before it."""
     duration = float(motion.duration()[0])
     count = max(math.ceil(duration * rate - MIN_LAST_STEP_FRACTION), 1)
     t = np.append(np.arange(count) / rate, duration)
+    if ticks_per_s is not None:
+        ticks = np.minimum(np.rint(t * ticks_per_s), np.floor(duration * ticks_per_s))
+        t = ticks / ticks_per_s
     states = motion.at_times(t[None])
     phase = motion.phase_at(t[None])[0] if isinstance(motion, Motion) else None
     values = states.q[0], states.dq[0], states.ddq[0], states.jerk[0]

@@ -21,6 +21,7 @@ from cnpgen.store.files.hdf5 import create_hdf5
 from cnpgen.store.joint_units import unit_of, units_of_joints
 from cnpgen.trajectory.spline_motion import Motion
 
+NANOSECONDS = 10**9  # per second, of stamps of ROS
 PATH_WAYPOINTS = 128  # of a path spline, equidistant in phase
 # YAML 1.1, which ROS's tools read, parses 1e-05 as text: a number needs a point before
 # its exponent.
@@ -180,6 +181,7 @@ class JointTrajectory(Exporter):
     """
 
     suffix = ".json"
+    ticks_per_s = NANOSECONDS
 
     def write(
         self, path: Path, plans: Iterable[SampledPlan], exported: ExportedSet
@@ -201,6 +203,7 @@ class TrajectoryControllerGoal(Exporter):
     """
 
     suffix = ".yaml"
+    ticks_per_s = NANOSECONDS
 
     def write(
         self, path: Path, plans: Iterable[SampledPlan], exported: ExportedSet
@@ -259,7 +262,7 @@ class PathSplines(Exporter):
 
 def _point_text(plan: SampledPlan, k: int, *, effort: bool = True) -> str:
     """Return sample k of a plan as a ``trajectory_msgs/JointTrajectoryPoint`` in one line of JSON that is also YAML."""
-    sec, nanosec = divmod(round(plan.t[k] * 1e9), 10**9)
+    sec, nanosec = divmod(round(plan.t[k] * NANOSECONDS), NANOSECONDS)
     values = {"positions": plan.q, "velocities": plan.dq, "accelerations": plan.ddq}
     point: dict[str, Any] = {name: rows[k].tolist() for name, rows in values.items()}
     if effort:

@@ -34,7 +34,12 @@ from cnpgen.plans.plans import Plans, make_plans
 from cnpgen.plans.tips import correct_tips
 from cnpgen.problems.problem import Problem
 from cnpgen.problems.problem_file import load_problem
-from cnpgen.problems.problem_record import ProblemRecord, as_record, record_problem
+from cnpgen.problems.problem_record import (
+    ProblemRecord,
+    as_record,
+    extrapolated_record,
+    record_problem,
+)
 from cnpgen.schema.argument_types import checked_arguments
 from cnpgen.store.dataset_spec import StoredProblem
 from cnpgen.store.files.atomic import write_file
@@ -52,7 +57,10 @@ from cnpgen.trajectory.boundary import Boundary
 
 @checked_arguments
 def load_plans(
-    path: str | Path, *, problem: Problem | StoredProblem | str | Path | None = None
+    path: str | Path,
+    *,
+    problem: Problem | StoredProblem | str | Path | None = None,
+    extrapolate: bool = False,
 ) -> Plans:
     """Read plans from a file of cnpgen or of other software.
 
@@ -64,6 +72,8 @@ def load_plans(
         path: Path of the file.
         problem: Required problem: a problem, a record, or the name or path of a
             problem, pipeline or dataset. Its tolerances replace those in the file.
+        extrapolate: Whether parameters may be outside of their ranges. The problem of
+            the plans then has wider ranges, and a name that ends with "-extrapolated".
 
     Raises:
         UsageError: The file does not exist or is of another kind.
@@ -90,6 +100,7 @@ def load_plans(
         wanted,
         content="plans",
         command="evaluate",
+        parameters=columns.get("parameters") if extrapolate else None,
     )
     try:
         plans = _assembled(path, record, columns, attributes)
@@ -182,12 +193,19 @@ def agreed_problem(
     *,
     content: str,
     command: str,
+    parameters: NDArray[Any] | None = None,
 ) -> ProblemRecord:
     """Return the problem of a file: the required one if it is consistent, or the file's own.
 
+    The ranges of both are widened by parameters that may be outside of them.
     Content and command, which has the option ``--problem``, are for messages:
     DatasetError for another problem, and UsageError without one.
     """
+    if parameters is not None:
+        stored, wanted = (
+            record and extrapolated_record(record, parameters)
+            for record in (stored, wanted)
+        )
     found = stored or wanted
     if found is None:
         help_ = f"set its attribute 'problem' to a name or a file, or pass {{problem}} ('cnpgen {command}' takes it)"

@@ -83,7 +83,6 @@ def scene_plans(
             outside its limits.
     """
     check_scenes(scenes)
-    refuse_changes(scenes, "solve_scenes changes the problem for them")
     full = with_capacity(problem, capacity_of(scenes) if capacity is None else capacity)
     record = record_problem(full)
     robot = open_problem(record)[1]
@@ -91,6 +90,7 @@ def scene_plans(
     scenes = [
         placed_scene(scene, robot, q) for scene, q in zip(scenes, start, strict=True)
     ]
+    refuse_changes(scenes, "solve_scenes changes the problem for them")
     start_dq = np.array([start_velocity(scene, robot) for scene in scenes])
     if goals is None:
         goals = [goal_states(scene, robot)[0] for scene in scenes]

@@ -374,11 +374,13 @@ def _locked_outside(
 def _repeated(raw: ProblemTables, array: str, key: str) -> Iterator[str]:
     seen: list[Any] = []
     for index, entry in tables(raw.table, array):
-        if key in entry and entry[key] in seen:
+        # Constraints of links may be of one kind, such as several regions.
+        name = entry if "link" in entry else entry.get(key)
+        if key in entry and name in seen:
             article = "an" if array[0] in "aeiou" else "a"
             text = f"there is {article} {array} {show(entry[key])} already: edit that one, or remove one of them"
             yield (raw.where / array / index / key).message(text)
-        seen.append(entry.get(key))
+        seen.append(name)
 
 
 def tables(table: dict[str, Any], array: str) -> list[tuple[int, dict[str, Any]]]:

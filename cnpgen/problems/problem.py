@@ -4,10 +4,11 @@ import dataclasses
 import hashlib
 import json
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -35,7 +36,7 @@ from cnpgen.robots.scene import PARKED_POSITION_M
 from cnpgen.robots.shape.inline import with_inline_meshes
 from cnpgen.robots.shape.mesh_files import find_urdf
 from cnpgen.robots.solid import pose_width
-from cnpgen.robots.urdf import read_urdf
+from cnpgen.robots.urdf import read_urdf, urdf_tree
 from cnpgen.robots.urdf_changes import (
     PAYLOAD,
     with_collision_geometry,
@@ -45,6 +46,7 @@ from cnpgen.robots.urdf_changes import (
     with_payload_link,
     with_point_masses,
 )
+from cnpgen.robots.urdf_elements import check_elements
 from cnpgen.schema import registry
 from cnpgen.schema.argument_types import checked_arguments
 from cnpgen.schema.keys import NAME, Range, field, to_dict
@@ -79,6 +81,16 @@ class Objective:
         """All terms in addition to the duration."""
         own = (Centrifugal(weight=self.centrifugal),) if self.centrifugal > 0 else ()
         return (*own, *self.term)
+
+
+class SceneColumns(NamedTuple):
+    """Columns of the values of a scene, ``obstacle_poses`` of kernels and ``Scene.poses``."""
+
+    obstacles: slice  # their poses and sizes
+    constraint: (
+        slice  # values of ``Problem.scene_constraint``, such as a puck's position
+    )
+    parameters: slice
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -336,13 +348,19 @@ class Problem:
         )
 
     @property
-    def scene_width(self) -> int:
-        """Number of values of a scene: poses and sizes of obstacles, those of the constraint above, parameters."""
+    def scene_columns(self) -> SceneColumns:
+        """Columns of the values of a scene."""
         constraint = self.scene_constraint
-        width = pose_width(self.obstacle) + (
-            0 if constraint is None else constraint.scene_width
-        )
-        return width + len(self.parameters)
+        obstacles = pose_width(self.obstacle)
+        own = obstacles + (0 if constraint is None else constraint.scene_width)
+        end = own + len(self.parameters)
+        return SceneColumns(slice(obstacles), slice(obstacles, own), slice(own, end))
+
+    @property
+    def scene_width(self) -> int:
+        """Number of values of a scene."""
+        width: int = self.scene_columns.parameters.stop
+        return width
 
     @property
     def uses_link_geometry(self) -> bool:
@@ -396,9 +414,12 @@ class Problem:
             return self.same_robot.urdf_text
         spec = self.robot
         positions = dict(zip(spec.locked_joints, spec.locked_positions, strict=True))
-        text = with_locked_joints(
-            read_urdf(self.urdf_path), positions, is_stored=self.is_stored
-        )
+        text = read_urdf(self.urdf_path)
+        if not self.is_stored:
+            # The reader of the robot raises errors about the text itself.
+            with suppress(ValueError):
+                check_elements(urdf_tree(text), self.urdf_path)
+        text = with_locked_joints(text, positions, is_stored=self.is_stored)
         text = with_point_masses(text)
         if not self.uses_link_geometry:
             return text

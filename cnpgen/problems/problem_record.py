@@ -13,6 +13,8 @@ from functools import cached_property, lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
+from numpy.typing import ArrayLike
+
 from cnpgen.arrays import Array
 from cnpgen.errors import RecipeError, UsageError
 from cnpgen.problems.objectives import read_objective
@@ -58,6 +60,7 @@ _SCALES = (
     "acceleration_cap",
     "torque_scale",
 )
+EXTRAPOLATED = "-extrapolated"  # end of the names of problems with wider ranges
 _FORM = {
     "name": TEXT,
     "robot": {"urdf": TEXT, "joints": [TEXT], "tip": TEXT, "base": [NUMBER]},
@@ -266,6 +269,31 @@ def record_problem(problem: Problem) -> ProblemRecord:
     """Return the record of a problem and its URDF."""
     recipe = json.dumps(plain(resolved(problem)), ensure_ascii=False, allow_nan=False)
     return ProblemRecord(recipe, problem.urdf_text)
+
+
+def extrapolated(problem: Problem, parameters: ArrayLike) -> Problem:
+    """Return a problem whose ranges contain values of its parameters, shape (N, p), with a name that marks it.
+
+    A problem whose ranges contain them already is returned unchanged. UsageError is
+    raised for values that no range may contain.
+    """
+    ranges = problem.parameters
+    rows = numbers("parameters", parameters)
+    if not len(ranges) or rows.ndim not in {1, 2} or rows.shape[-1] != len(ranges):
+        # Errors of the shape are those of the reader.
+        return problem
+    wider = ranges.widened(rows.reshape(-1, len(ranges)))
+    if not ranges.out_of_range(rows.reshape(-1, len(ranges))):
+        return problem
+    name = problem.name.removesuffix(EXTRAPOLATED) + EXTRAPOLATED
+    return replace(problem, parameters=wider, name=name)
+
+
+def extrapolated_record(record: ProblemRecord, parameters: ArrayLike) -> ProblemRecord:
+    """Return the record of an extrapolated problem; see ``extrapolated``."""
+    problem = as_problem(record)
+    wider = extrapolated(problem, parameters)
+    return record if wider is problem else record_problem(wider)
 
 
 def as_problem(problem: object) -> Problem:

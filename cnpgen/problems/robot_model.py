@@ -83,7 +83,7 @@ class RobotModel:
     Args:
         problem: The problem, its record, or the name or file of a problem, a pipeline
             or a dataset.
-        backend: "compiled", "numpy" or "casadi"; by default the fastest available.
+        backend: "compiled" or "numpy"; by default the fastest available.
 
     Attributes:
         problem: The problem.

@@ -216,9 +216,7 @@ def _powers_of_rate(problem: Problem, world: World, kernels: ResidualKernels) ->
     w[: 2 * n] = random.uniform(0.1, 1.0, (2 * n, 1))
     w[orders * n] = 1.0, 2.0
     scene = np.zeros((problem.scene_width, 2))
-    scene[problem.scene_width - len(problem.parameters) :] = (
-        world.robot.nominal_parameters[:, None]
-    )
+    scene[problem.scene_columns.parameters] = world.robot.nominal_parameters[:, None]
     (g,) = kernels.values(w, scene)
     with np.errstate(divide="ignore", invalid="ignore"):
         powers = np.log2(g[:, 1] / g[:, 0]).round()

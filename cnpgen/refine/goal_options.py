@@ -37,10 +37,12 @@ def refine_goal_options(
     journal: str | Path | None,
     begin: Callable[[int, int], None] | None,
     progress: Progress | None,
+    first_valid: bool = False,
 ) -> Refinement:
     """Refine plans to several goal states of each task; return the refinement of the best row of each, in their order.
 
-    The arguments are those of ``refine_plans``, which ``refine`` calls. Later rounds
+    With ``first_valid`` a task ends with its first valid motion. The other arguments are
+    those of ``refine_plans``, which ``refine`` calls. Later rounds
     have files beside the journal. ``begin`` is called with the number of tasks, and
     tasks count as finished after their first goal state.
     """
@@ -51,7 +53,8 @@ def refine_goal_options(
     chosen, lowest, files = dict[int, int](), dict[int, float](), list[Path]()
     if begin is not None:
         begin(len(tasks), 0)
-    for round_number, rows in enumerate(_rounds(plans, min_durations(plans), lowest)):
+    bounds = np.full(len(plans), np.inf) if first_valid else min_durations(plans)
+    for round_number, rows in enumerate(_rounds(plans, bounds, lowest)):
         file = (
             Path(f"{journal}.{round_number}" if round_number else f"{journal}")
             if journal is not None

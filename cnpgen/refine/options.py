@@ -32,6 +32,9 @@ class RefineOptions:
         stay_within: Largest difference of every joint from the input path at the same
             phase [rad or m], or None. Input plans that the refiner cannot use as
             initial guesses have no such bound.
+        time_limit: Time per plan [s] after which the search ends with the first valid
+            plan, or None; 0 returns the first plan that the verdict accepts. Results
+            with a limit above 0 depend on the machine and its load.
 
     Raises:
         UsageError: A value is invalid.
@@ -43,6 +46,7 @@ class RefineOptions:
     tolerance: float = DEFAULT_SETTINGS.cost_tolerance
     deadline: float | None = None
     stay_within: float | None = None
+    time_limit: float | None = None
 
     def __post_init__(self) -> None:
         check_fields(self)
@@ -68,11 +72,20 @@ class RefineOptions:
             raise UsageError(
                 f"must be above 0, got {self.stay_within}", argument="stay_within"
             )
+        if self.time_limit is not None and number("time_limit", self.time_limit) < 0:
+            raise UsageError(
+                f"must not be negative, got {self.time_limit}", argument="time_limit"
+            )
+        if self.time_limit is not None and self.deadline is not None:
+            raise UsageError(
+                "a time limit ends the search with a valid plan, a deadline in any case: choose one",
+                concerns="time_limit",
+            )
         check_range("stay_within", self.stay_within or 0.0, 0.0, MAX_STAY_WITHIN, "rad")
 
     def document(self) -> dict[str, Any]:
-        """Return the options for JSON, without a deadline or a distance of None."""
-        optional = {"deadline", "stay_within"}
+        """Return the options for JSON, without a deadline, a distance or a limit of None."""
+        optional = {"deadline", "stay_within", "time_limit"}
         return {
             name: value
             for name, value in asdict(self).items()

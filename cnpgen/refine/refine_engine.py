@@ -14,6 +14,7 @@ from cnpgen.plans.plans import Plans
 from cnpgen.problems.obstacles import goal_velocities, scene_of
 from cnpgen.problems.problem import Problem
 from cnpgen.problems.problem_record import ProblemRecord, open_problem
+from cnpgen.refine.first_plan import refine_task_within
 from cnpgen.refine.options import RefineOptions
 from cnpgen.refine.refiner import Refiner
 from cnpgen.refine.strategy import PlanChecker, refine_task, refine_task_until
@@ -43,6 +44,11 @@ def refine_serially(plans: Plans, options: RefineOptions) -> list[Attempt]:
             refine_task_until(refiner, checker, task, options.deadline)
             for task in tasks
         ]
+    if options.time_limit is not None:
+        return [
+            refine_task_within(refiner, checker, task, options.time_limit)
+            for task in tasks
+        ]
     return [refine_task(refiner, checker, task) for task in tasks]
 
 
@@ -51,7 +57,7 @@ def prepare(plans: Plans, options: RefineOptions) -> Refiner:
     return _refiner(
         plans.problem,
         plans.motion.spec,
-        replace(options, deadline=None, stay_within=None),
+        replace(options, deadline=None, stay_within=None, time_limit=None),
     )
 
 

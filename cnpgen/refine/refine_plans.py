@@ -10,6 +10,7 @@ from contextlib import closing
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -54,7 +55,7 @@ def solve_plans(
 
     Problems with the column ``goal_option`` are goal states of tasks: rows with the
     same ``sample_id`` belong to one task, and the result has the best valid motion to
-    any of its goal states, one row for each task.
+    any of its goal states, one row for each task; with a time limit, the first valid one.
 
     ``problems`` come from ``draw_boundary_problems`` or ``load_boundary_problems``. The
     other arguments, and the errors, are those of ``refine_plans``.
@@ -64,19 +65,40 @@ def solve_plans(
         path_control_points=np.full_like(problems.path_control_points, np.nan),
         rate_control_points=np.full_like(problems.rate_control_points, np.nan),
     )
-    run = partial(
-        refine_plans,
+    return refine_tasks(
+        without_plans,
         options=options,
         workers=workers,
         engine=engine,
         address=address,
+        journal=journal,
         discard=discard,
+        begin=begin,
+        progress=progress,
     )
-    if GOAL_OPTION in problems.columns and len(problems):
+
+
+def refine_tasks(
+    plans: Plans,
+    *,
+    options: RefineOptions,
+    journal: str | Path | None,
+    begin: Callable[[int, int], None] | None,
+    progress: Progress | None,
+    **run: Any,
+) -> Refinement:
+    """Refine plans, or plan where control points are nan; goal states of tasks are those of ``solve_plans``."""
+    refine: Callable[..., Refinement] = partial(refine_plans, options=options, **run)
+    if GOAL_OPTION in plans.columns and len(plans):
         return refine_goal_options(
-            without_plans, run, journal=journal, begin=begin, progress=progress
+            plans,
+            refine,
+            journal=journal,
+            begin=begin,
+            progress=progress,
+            first_valid=options.time_limit is not None,
         )
-    return run(without_plans, journal=journal, begin=begin, progress=progress)
+    return refine(plans, journal=journal, begin=begin, progress=progress)
 
 
 @checked_arguments

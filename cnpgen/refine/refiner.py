@@ -30,7 +30,6 @@ from cnpgen.refine.solver.bounds import (
 from cnpgen.refine.solver.compiled_backend import load_step_library
 from cnpgen.refine.solver.grid import make_grid
 from cnpgen.refine.solver.hull_levels import (
-    CompiledHullTranscription,
     HullFeedback,
     HullTranscription,
     can_measure_hulls,
@@ -98,14 +97,12 @@ class Refiner:
         cost_term = choose_cost_term(problem, options.objective, options.weight)
         if kernels is None:
             kernels = problem_kernels(problem, robot, *choose_backend(None))
-        library, world = (
-            load_collision_library(kernels),
-            World(robot, problem.obstacle, problem.object_size),
-        )
-        self.measures_hulls = library is not None and can_measure_hulls(
-            problem, robot, world
-        )
-        self._library, self._hulls, solved = library, dict[int, Hulls](), problem
+        world = World(robot, problem.obstacle, problem.object_size)
+        # The hulls of each thread.
+        self._hulls, solved = dict[int, Hulls](), problem
+        self.measures_hulls = can_measure_hulls(problem, robot, world)
+        if self.measures_hulls or has_clearance_constraints(problem, robot):
+            self._library = load_collision_library(kernels)
         if self.measures_hulls:
             solved = without_distances(problem)
             kernels = problem_kernels(
@@ -118,12 +115,12 @@ class Refiner:
             self.spec,
             kernels.load_by_structure(stage_values),
             kernels.load_by_structure(stage_jacobian),
+            load_step_library(kernels),
             cost_term,
             None
             if cost_term is None
             else kernels.load_by_structure(cost_term_residuals, terms=cost_term.tables),
             () if cost_term is None else residual_counts(robot, cost_term),
-            load_step_library(kernels),
         )
         self.levels = (
             default_grid_levels(problem, self.settings) if levels is None else levels
@@ -203,10 +200,7 @@ class Refiner:
             settings = replace(settings, max_iterations=0)
         hulls = self.hulls if self.measures_hulls else hulls
         if hulls is not None:
-            kind = (
-                CompiledHullTranscription if self.measures_hulls else HullTranscription
-            )
-            motion = kind(motion, hulls, task.scene.poses[0])
+            motion = HullTranscription(motion, hulls, task.scene.poses[0])
             more: Array | float = 0.0 if extra is None else extra
             if self.measures_hulls:
                 more = more - accepted_along(
@@ -407,10 +401,9 @@ class Refiner:
     def tip_path_guesses(self, task: RefinementTask) -> Iterator[Array]:
         """Yield the variables of motions along the initial tip paths of the problem's constraint."""
         constraint = self.problem.scene_constraint
-        # Of all values before the parameters.
-        width = self.problem.scene_width - len(self.problem.parameters)
-        values = task.scene.poses[0, pose_width(self.problem.obstacle) : width]
-        frame = table_frame_of(self.problem, task.scene.poses[:, width:])
+        columns, poses = self.problem.scene_columns, task.scene.poses
+        values = poses[0, columns.constraint]
+        frame = table_frame_of(self.problem, poses[:, columns.parameters])
         start = (
             task.start_xyz if frame is None else frame.to_table(task.start_xyz[None])[0]
         )

@@ -111,7 +111,7 @@ class RestSpace:
         first = _first(~np.logical_and.reduce(met[~self.capsules]))
         if first:
             first = _first(
-                ~self.hulls.clear_states(q[:, :first], poses, uncovered_only=True)
+                ~self.hulls.clear_states(q[:, :first], poses, links_only=True)
             )
         resolved = np.logical_and.reduce(met[self.capsules]) & self.capsules.any()
         unresolved = np.flatnonzero(~resolved[:first])
@@ -297,7 +297,7 @@ class TreeSearch:
         Paths of large trees with shorter edges follow.
         """
         found, seeds = list[Array](), count()
-        line = self._grow(0, 0, TREE_EXTENSION_RAD)
+        line = self._line()
         if line is not None:
             yield line
             return
@@ -316,6 +316,15 @@ class TreeSearch:
         ]:
             yield found[index]
         yield from self._large_trees(seeds, SHORT_TREE_EXTENSION_RAD, bool(found))
+
+    def first_paths(self) -> Iterator[Array]:
+        """Yield the line if it is valid, else the paths of small trees, each as soon as it is found."""
+        line = self._line()
+        yield from self._small_trees(count()) if line is None else [line]
+
+    def _line(self) -> Array | None:
+        """Return the straight line if it is valid: trees without extensions connect."""
+        return self._grow(0, 0, TREE_EXTENSION_RAD)
 
     def _small_trees(self, seeds: Iterator[int]) -> Iterator[Array]:
         """Yield the paths of small trees with every margin, and of further ones if these find enough."""

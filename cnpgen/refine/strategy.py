@@ -12,7 +12,7 @@ finds a smaller violation, or none and a lower cost.
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 
@@ -59,9 +59,15 @@ VERDICT_TIME_S = 5e-3  # of a verdict, before one was timed
 
 @np.errstate(all="ignore")  # squares of huge boundary conditions overflow
 def refine_task(
-    refiner: Refiner, checker: PlanChecker, task: RefinementTask
+    refiner: Refiner,
+    checker: PlanChecker,
+    task: RefinementTask,
+    is_over: Callable[[bool], bool] = lambda _: False,
 ) -> Attempt:
-    """Refine the input plan of a task, or plan without one."""
+    """Refine the input plan of a task, or plan without one.
+
+    ``is_over``, called with whether an attempt is valid, ends the search after an attempt.
+    """
     if not task.is_finite:
         return _invalid_input(refiner, task)
     search, x = RefinementSearch(refiner, checker, task), refiner.input_variables(task)
@@ -70,6 +76,7 @@ def refine_task(
             search.add(attempt)
             or search.found_no_path
             or search.ends_are_invalid()
+            or is_over(search.has_valid)
             or search.continue_rejected(attempt)
         ):
             break
@@ -277,9 +284,12 @@ class RefinementSearch:
         The ends are measured once, after the first attempt that was not accepted: most
         tasks are solved by their first attempt and pay nothing.
         """
-        if any(attempt.valid for attempt in self.judged):
-            return False
-        return self._reason_of_ends is not None
+        return not self.has_valid and self._reason_of_ends is not None
+
+    @property
+    def has_valid(self) -> bool:
+        """Whether an attempt is valid."""
+        return any(attempt.valid for attempt in self.judged)
 
     def explained(self, best: Attempt) -> Attempt:
         """Return the best attempt; without a valid one, with the reason of an invalid end if there is one."""

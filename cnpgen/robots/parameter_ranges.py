@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
 
@@ -198,6 +198,29 @@ class ParameterRanges:
                 low, high, got = distinct(span.low, span.high, value)
                 return f"{name} must be from {low} to {high}, got {got} in row {row}"
         return ""
+
+    def widened(self, rows: Array) -> ParameterRanges:
+        """Return the ranges that also contain values of shape (N, width); those that are not numbers are ignored.
+
+        Raises:
+            UsageError: A value is outside of the bounds of every range of its kind.
+        """
+        declared = {key.name: key for key in keys(type(self))}
+        spans = {}
+        for name, span, values in zip(self.names, self.ranges, rows.T, strict=True):
+            finite = values[np.isfinite(values)].tolist()
+            low, high = min(finite, default=span.low), max(finite, default=span.high)
+            key = declared[name]
+            least = -np.inf if key.low is None else key.low
+            largest = np.inf if key.high is None else key.high
+            if low < least or high > largest:
+                got = low if low < least else high
+                raise UsageError(
+                    f"{name} cannot be extrapolated to {got:g}, expected {least:g} to {largest:g}",
+                    argument="parameters",
+                )
+            spans[name] = Range(min(low, span.low), max(high, span.high))
+        return replace(self, **spans)
 
     def describe(self) -> Iterator[str]:
         """Yield a text of every parameter with its range in SI units."""

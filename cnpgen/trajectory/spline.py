@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cnpgen.arrays import Array
+from cnpgen.trajectory.trajectory_spec import TrajectorySpec
 
 # Larger control points are scaled, because products of them would overflow.
 
@@ -46,6 +47,17 @@ def basis(s: Array, points: int, degree: int, order: int = 0) -> Array:
     for k, weight in enumerate(_cox_de_boor(s, knots, degree, first)):
         values += weight[:, None] * matrix[first + k]
     return values
+
+
+def basis_tables(
+    spec: TrajectorySpec, s: Array, orders: int
+) -> tuple[list[Array], list[Array]]:
+    """Evaluate the bases of p, shape (K, C), at K phases for each of some orders, and those of r, (K, R), one order less."""
+    path, rate = spec.path_control_points, spec.rate_control_points
+    return (
+        [basis(s, path, spec.degree, order) for order in range(orders)],
+        [basis(s, rate, spec.degree, order) for order in range(orders - 1)],
+    )
 
 
 def derivative(points: int, degree: int, order: int) -> tuple[Array, Array]:

@@ -72,8 +72,8 @@ class MachineReport:
         environment: Relevant environment variables set by the user.
         generator: Generator of machine code and its processor; empty if it does not
             work.
-        handwritten: Origin of the handwritten C code: the package, a compiler at first
-            use, or "NumPy" in its place.
+        handwritten: Origin of the handwritten C code: the package, or a compiler at first
+            use; "missing" without both.
         compiler: C compiler and its version; empty if there is none.
         backend: Backend of the kernels; empty if none works.
         backend_reason: Reason for the choice of the backend.
@@ -269,11 +269,11 @@ def _check_handwritten(findings: _Findings) -> tuple[str, str]:
         compiler = ""
         if not built:
             findings.notes.append(
-                f"{error}; collisions, trees, refining and observations run in NumPy, which is slower"
+                f"{error}; without compiled C code planners, the refiner, scenes and observations do not work"
             )
     if built:
         return f"compiled with the package for {built}", compiler
-    return ("compiled at its first use" if compiler else "NumPy in its place"), compiler
+    return ("compiled at its first use" if compiler else "missing"), compiler
 
 
 def _built_variant() -> str:

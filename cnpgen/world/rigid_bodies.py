@@ -7,7 +7,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cnpgen.arrays import Array
-from cnpgen.robots.shape.convex_part import Contacts
 from cnpgen.robots.shape.hull import ball_round
 from cnpgen.robots.shape.shape import Shape
 from cnpgen.robots.solid import Solid, same_shape
@@ -127,52 +126,6 @@ class RigidBodies:
             return self._placed(a, k), self._placed(b, k)
 
         return PairDistances(self._bounds(pairs), measure, separation, bodies_at)
-
-    def contacts(self, pairs: Pairs, within: float) -> Contacts:
-        """Measure ``obstacle_pairs`` or ``link_pairs`` at states where their signed distance is below ``within`` [m].
-
-        The separating direction of a pair that is farther at one state also excludes
-        most of the other states.
-        """
-        near, contacts = ~(self._bounds(pairs) >= within), list[Any]()
-        for pair in np.flatnonzero(near.any(axis=1)).tolist():
-            # Ordered by state; each measured state may exclude later ones.
-            (a, b), unresolved = pairs[pair].tolist(), np.flatnonzero(near[pair])
-            while len(unresolved):
-                k, unresolved = int(unresolved[0]), unresolved[1:]
-                distance, direction = self._measure(a, b, k)
-                if distance < within:
-                    contacts.append(
-                        (pair, k, distance, direction, self._certified.witnesses())
-                    )
-                elif len(unresolved) and np.isfinite(direction).all():
-                    unresolved = unresolved[
-                        ~(self._separation(a, b, direction, unresolved) >= within)
-                    ]
-        return self._gathered(
-            pairs, [contact for contact in contacts if np.isfinite(contact[3]).all()]
-        )
-
-    def _gathered(self, pairs: Pairs, contacts: list[Any]) -> Contacts:
-        """Gather tuples of pair, state, distance, direction in the frame of the first body, and points."""
-        columns = zip(*contacts, strict=True) if contacts else [()] * 5
-        pair, k, distance, direction, points = (np.array(column) for column in columns)
-        pair, k = pair.astype(np.intp), k.astype(np.intp)
-        # Coal's direction is in the frame of the first body; contacts are in the world.
-        frames = np.array(self._frames, np.intp)[pairs[pair]]
-        normal = np.einsum(
-            "cij,cj->ci",
-            self._rotations[frames[:, 0], ..., k],
-            direction.reshape(-1, 3),
-        )
-        return Contacts(pair, k, distance, normal, points.reshape(-1, 2, 3))
-
-    def joints_of(self, bodies: Pairs) -> NDArray[np.intp]:
-        """Return the indices of the joints that move bodies; 0 for fixed bodies."""
-        moved = np.where(
-            np.arange(len(self._frames)) < len(self._balls), self._frames, 0
-        )
-        return np.asarray(moved[bodies], np.intp)
 
     def extent(self, joint: int) -> float:
         """Return the largest distance of a point that is fixed to a joint's frame from its origin [m]."""

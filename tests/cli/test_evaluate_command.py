@@ -129,6 +129,7 @@ def test_metrics_and_margins_are_those_of_the_verdict(
     ]
     assert line.split()[2:] == [
         "1",
+        "-",
         f"{worst.violation:.2e}",
         "1.0e-03",
         "m",
@@ -137,6 +138,9 @@ def test_metrics_and_margins_are_those_of_the_verdict(
         worst.part,
     ]
     assert worst.part in {"pedestal-1", "pedestal-2"}
+    margin = verdict.margins["joint position"]
+    (line,) = [line for line in out.splitlines() if line.startswith("  joint position")]
+    assert line.split()[2:5] == ["0", f"{-margin.violation:.2e}", "-"]
 
 
 def test_plans_are_listed_a_line_each_those_that_are_not_valid_first(

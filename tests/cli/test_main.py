@@ -183,7 +183,7 @@ def test_a_wrong_unit_is_named(run):
         (("make-datset", "x"), "'make-dataset'"),
         (("make-dataset", "airhockey-hit", "--worker", "4"), "'--workers'"),
         (("make-dataset", "airhockey-hit", "--shardsize=4"), "'--shard-size'"),
-        (("make-dataset", "airhockey-hit", "--backend", "cassadi"), "'casadi'"),
+        (("make-dataset", "airhockey-hit", "--backend", "numpi"), "'numpy'"),
         (("make-dataset", "airhocky-hit"), "'airhockey-hit'"),
         (("show", "airhockey-hot"), "'airhockey-hit'"),
         (("show", "--stage", "start-k"), "'start-ik'"),

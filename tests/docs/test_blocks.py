@@ -1,6 +1,7 @@
 """Every block in the README and the docs runs as it is shown."""
 
 import configparser
+import importlib.util
 import os
 import re
 import shutil
@@ -10,6 +11,7 @@ import tomllib
 from collections.abc import Iterator
 from importlib.util import find_spec
 from pathlib import Path
+from types import ModuleType
 from typing import Any
 
 import numpy as np
@@ -28,14 +30,30 @@ ROOT = Path(__file__).parents[2]
 README = ROOT / "README.md"
 PAGES = [README, *sorted((ROOT / "docs").rglob("*.md"))]
 PLUG_INS = ROOT / "docs" / "how-to" / "plug-ins.md"
-BLOCK = re.compile(r"((?:<!-- [^\n]* -->\n)*)```(\w*)\n(.*?)```", re.S)
 RUNNABLE = {"bash", "python", "toml"}
+
+
+def output_blocks() -> ModuleType:
+    """Load docs/outputs.py."""
+    spec = importlib.util.spec_from_file_location(
+        "outputs", ROOT / "docs" / "outputs.py"
+    )
+    assert spec
+    assert spec.loader
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+outputs = output_blocks()
 
 
 def blocks(page: Path) -> list[tuple[dict[str, str], str, str]]:
     """Return (markers, language, text) of the fenced blocks of a page."""
     found = []
-    for marks, language, text in BLOCK.findall(page.read_text(encoding="utf-8")):
+    for marks, language, text in outputs.BLOCK.findall(
+        page.read_text(encoding="utf-8")
+    ):
         pairs = re.findall(r"<!-- (\w+)(?:: (\S+))? -->", marks)
         found.append((dict(pairs), language, text))
     return found
@@ -85,18 +103,25 @@ def needed(tmp_path_factory: pytest.TempPathFactory) -> Path:
     ).folder
 
 
+def runs_here(marks: dict[str, str]) -> bool:
+    """Return whether this machine has what a block needs; .ci/run or the extended run has the rest."""
+    return not (
+        ("library" in marks and find_spec(marks["library"]) is None)
+        or ("robots" in marks and example_robots.folder() is None)
+        or ("program" in marks and shutil.which(marks["program"]) is None)
+        # .ci/run runs these two in fresh environments.
+        or "install" in marks
+        or "test" in marks
+    )
+
+
 def shown(page: Path) -> Iterator[tuple[dict[str, str], str, str]]:
-    """List the blocks of a page that can be run here."""
+    """List the blocks of a page that can be run here, each with its output blocks."""
+    runs = False
     for marks, language, text in blocks(page):
-        if "library" in marks and find_spec(marks["library"]) is None:
-            continue  # .ci/run or the extended run has it
-        if "robots" in marks and example_robots.folder() is None:
-            continue  # the extended run has the package of robots
-        if "program" in marks and shutil.which(marks["program"]) is None:
-            continue  # not on every machine
-        if "install" in marks or "test" in marks:
-            continue  # .ci/run runs these two in fresh environments
-        yield marks, language, text
+        runs = runs if "output" in marks else runs_here(marks)
+        if runs:
+            yield marks, language, text
 
 
 @pytest.mark.slow
@@ -104,7 +129,11 @@ def shown(page: Path) -> Iterator[tuple[dict[str, str], str, str]]:
 def test_the_blocks_of_a_page_run_in_order(
     page: Path, needed: Path, tmp_path: Path
 ) -> None:
+    printed = ""
     for marks, language, text in shown(page):
+        if "output" in marks:
+            assert outputs.absent_lines(text, printed) == [], printed
+            continue
         if "needs" in marks and not (tmp_path / marks["needs"]).exists():
             shutil.copytree(needed, tmp_path / marks["needs"])
         if "file" in marks:
@@ -112,9 +141,19 @@ def test_the_blocks_of_a_page_run_in_order(
             path.parent.mkdir(parents=True, exist_ok=True)
             path.write_text(text, encoding="utf-8")
         elif language == "bash":
-            run(["bash", "-euo", "pipefail", "-c", text], tmp_path)
+            printed = run(["bash", "-euo", "pipefail", "-c", text], tmp_path)
         elif language == "python":
-            run([sys.executable, "-c", text], tmp_path)
+            printed = run([sys.executable, "-c", text], tmp_path)
+
+
+def test_an_output_block_shows_lines_of_the_output_in_their_order() -> None:
+    printed = "valid 3 of 8\nmotion time  0.42 s\n-----\nend\n"
+    assert outputs.absent_lines("valid 5 of 8\n...\nend\n", printed) == []
+    assert outputs.absent_lines("valid 5 of 9\ninvalid 2\n", printed) == ["invalid 2"]
+    assert outputs.absent_lines("end\nvalid 3 of 8\n", printed) == ["valid 3 of 8"]
+    assert outputs.renewed("motion time 0.5 s\n...\n", printed) == (
+        "motion time  0.42 s\n...\n"
+    )
 
 
 WRITTEN = {

@@ -16,6 +16,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from cnpgen.addons.manual.name_page import name_page
 from cnpgen.cli.docs_command import list_pages, page_url
 from cnpgen.machine import versions
 from tests.conftest import HANGING
@@ -106,7 +107,7 @@ def test_every_tutorial_links_to_its_notebook(site: Path) -> None:
 def test_every_public_name_has_a_page_with_its_signature(site: Path) -> None:
     names = re.findall(
         r"^\| `(\w+)` \|",
-        (ROOT / "docs" / "reference" / "api.md").read_text(encoding="utf-8"),
+        name_page(),
         re.M,
     )
     pages = {
@@ -291,6 +292,15 @@ def test_the_gallery_is_part_of_the_site(site: Path) -> None:
     assert {path.stem for path in (site / "gallery").glob("*.html")} == set(frames)
     for name in re.findall(r'<img src="../../gallery/([\w-]+).png"', text):
         assert (site / "gallery" / f"{name}.png").stat().st_size > 10_000
+
+
+@pytest.mark.extended
+def test_pages_of_planners_are_part_of_the_site_and_linked(site: Path) -> None:
+    pytest.importorskip("ziglang")
+    text = (site / "docs" / "how-to" / "deploy.html").read_text(encoding="utf-8")
+    linked = re.findall(r'href="../../interactive/(\w+).html"', text)
+    pages = [path.stem for path in (site / "interactive").glob("*.html")]
+    assert sorted(linked) == sorted(pages) == ["puck", "transport"]
 
 
 @pytest.mark.extended

@@ -15,6 +15,7 @@ from cnpgen.problems.problem import Problem
 from cnpgen.refine.grid_levels import GridLevels
 from cnpgen.refine.options import RefineOptions
 from cnpgen.refine.refiner import Refiner
+from cnpgen.refine.solver.compiled_backend import load_step_library
 from cnpgen.refine.solver.grid import make_grid
 from cnpgen.refine.solver.residuals import (
     CostTerm,
@@ -58,7 +59,7 @@ def transcription_of(
         parts = cost_term, residuals, residual_counts(plan.robot, cost_term)
     grid = make_grid(spec, points)
     return Transcription(
-        ResidualKernels(spec, *stages, *parts),
+        ResidualKernels(spec, *stages, load_step_library(kernels), *parts),
         grid,
         boundary=plan.boundary,
         obstacle_poses=obstacle_poses(plan),

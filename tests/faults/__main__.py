@@ -1,185 +1,152 @@
 """Fault injection: ``python -m tests.faults --kills 200 --inputs 100000 --calls 20000``.
 
-``--goal`` runs all kinds of faults in their full numbers. The exit code is 1 if there
-are findings.
+``--goal`` runs all kinds of faults in their full numbers. Seeds are drawn when a run
+begins. With ``--progress FILE``, an interrupted run continues, and a change of the
+package begins a new one. The exit code is 1 if there are findings.
 """
 
 import argparse
 import sys
+from collections import Counter
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
 
 from tests.faults.call_fuzz import fuzz_calls
+from tests.faults.chunk_orders import run_chunk_orders
 from tests.faults.flips import flip_bits
 from tests.faults.fuzz import fuzz
 from tests.faults.kills import kill
+from tests.faults.progress import Part, Progress, load_progress, save_progress
 from tests.faults.stop_orders import StopOutcome, run_orders, stop_at_hard_moments
 from tests.faults.subjects import SUBJECTS
 
-GOAL = {
-    "inputs": 100_000,
-    "kills": 500,
-    "calls": 5_000,
-    "flips": 2_000,
-    "stops": 100_000,
-    "moments": 180,
+
+def inputs(count: int, seed: int, first: int, kinds: tuple[str, ...]) -> Part:
+    """Read changed files."""
+    outcome = fuzz(count, seed=seed, first=first, kinds=kinds)
+    counts = Counter({f"{kind}, read": n for kind, n in outcome.read.items()})
+    counts.update({f"{kind}, refused": n for kind, n in outcome.refused.items()})
+    return Part(count, first + count, counts, outcome.findings)
+
+
+def kills(count: int, seed: int, first: int, _kinds: tuple[str, ...]) -> Part:
+    """Kill processes and resume their runs."""
+    killed = kill(count, seed=seed, first=first)
+    following = first + killed.n_runs
+    return Part(killed.n_signals, following, killed.runs, killed.findings)
+
+
+def calls(count: int, seed: int, first: int, _kinds: tuple[str, ...]) -> Part:
+    """Call public functions with wrong arguments."""
+    outcome = fuzz_calls(count, seed=seed, first=first)
+    counts = Counter(returned=outcome.returned, refused=outcome.refused)
+    return Part(count, first + count, counts, outcome.findings)
+
+
+def flips(count: int, seed: int, first: int, _kinds: tuple[str, ...]) -> Part:
+    """Flip bits of files with checksums."""
+    flipped = flip_bits(count, seed=seed, first=first)
+    return Part(count, first + count, Counter(flipped.refused), flipped.findings)
+
+
+def stops(count: int, seed: int, first: int, _kinds: tuple[str, ...]) -> Part:
+    """Run random orders of requests to a runtime, and as many to an executor of chunks."""
+    plans = count - count // 2
+    outcome = run_orders(plans, seed=seed, first=first)
+    chunks = run_chunk_orders(count // 2, seed=seed, first=first)
+    outcome.requests.update(chunks.requests)
+    outcome.findings += chunks.findings
+    return _of_stops(outcome, count, first)
+
+
+def moments(count: int, seed: int, first: int, _kinds: tuple[str, ...]) -> Part:
+    """Stop at hard moments."""
+    return _of_stops(stop_at_hard_moments(count, seed=seed + first), count, first)
+
+
+def _of_stops(outcome: StopOutcome, count: int, first: int) -> Part:
+    return Part(count, first + count, outcome.requests, outcome.findings)
+
+
+@dataclass(frozen=True)
+class Fault:
+    """A kind of faults.
+
+    Attributes:
+        text: Description of one fault.
+        goal: Number of faults without a finding that is the goal.
+        block: Number of faults between two notes of the progress.
+        run: Runs faults: a number, the seed, the index of the first one, and kinds of
+            files.
+    """
+
+    text: str
+    goal: int
+    block: int
+    run: Callable[[int, int, int, tuple[str, ...]], Part]
+
+
+FAULTS = {
+    "inputs": Fault("changed files to read", 100_000, 2_000, inputs),
+    "kills": Fault("processes to kill; their runs are resumed", 500, 50, kills),
+    "calls": Fault("calls of public functions, wrong arguments", 5_000, 1_000, calls),
+    "flips": Fault("flipped bits of files with checksums", 2_000, 500, flips),
+    "stops": Fault("random orders of requests to a runtime", 100_000, 1_000, stops),
+    "moments": Fault("stops at times at which they are hard", 180, 60, moments),
 }
 
 
 def main() -> int:
     """Run the requested faults."""
     parser = argparse.ArgumentParser(prog="python -m tests.faults", description=__doc__)
-    parser.add_argument(
-        "--inputs", metavar="N", type=int, default=0, help="changed files to read"
-    )
-    parser.add_argument(
-        "--kills",
-        metavar="N",
-        type=int,
-        default=0,
-        help="processes to kill; their runs are resumed",
-    )
-    parser.add_argument(
-        "--calls",
-        metavar="N",
-        type=int,
-        default=0,
-        help="calls of public functions, wrong arguments",
-    )
-    parser.add_argument(
-        "--flips",
-        metavar="N",
-        type=int,
-        default=0,
-        help="flipped bits of files with checksums",
-    )
-    parser.add_argument(
-        "--stops",
-        metavar="N",
-        type=int,
-        default=0,
-        help="random orders of stop, replan, switch, resume and close",
-    )
-    parser.add_argument(
-        "--moments",
-        metavar="N",
-        type=int,
-        default=0,
-        help="stops at times at which they are hard",
-    )
-    parser.add_argument(
-        "--goal", action="store_true", help=f"all of them: {GOAL}; takes hours"
-    )
-    parser.add_argument(
-        "--seed", metavar="S", type=int, default=0, help="seed of all faults"
-    )
-    parser.add_argument(
-        "--first",
-        metavar="I",
-        type=int,
-        default=0,
-        help="number of the first input or run",
-    )
-    parser.add_argument(
-        "--kind",
-        choices=tuple(SUBJECTS),
-        action="append",
-        help="only files of this kind",
-    )
+    option = parser.add_argument
+    for name, fault in FAULTS.items():
+        option(f"--{name}", metavar="N", type=int, default=0, help=fault.text)
+    goal = {name: fault.goal for name, fault in FAULTS.items()}
+    option("--goal", action="store_true", help=f"all of them: {goal}; takes hours")
+    option("--seed", metavar="S", type=int, help="seed of all faults; drawn by default")
+    option("--first", metavar="I", type=int, default=0, help="first input or run")
+    option("--progress", metavar="FILE", type=Path, help="file to continue a run")
+    option("--kind", choices=tuple(SUBJECTS), action="append", help="kind of files")
     arguments = parser.parse_args()
     if arguments.goal:
-        vars(arguments).update(GOAL)
-    runs = {name: run for name, run in RUNS.items() if vars(arguments)[name]}
-    codes = {name: run(arguments) for name, run in runs.items()}
-    return max(codes.values(), default=0)
+        vars(arguments).update(goal)
+    progress = load_progress(arguments.progress, arguments.seed)
+    print(f"seed {progress.seed}", flush=True)
+    kinds = tuple(arguments.kind or SUBJECTS)
+    for name in FAULTS:
+        if count := getattr(arguments, name):
+            part = progress.parts.setdefault(name, Part(next=arguments.first))
+            _run(name, count, progress, kinds, arguments.progress)
+            _report(name, part)
+    return int(any(part.findings for part in progress.parts.values()))
 
 
-def inputs(arguments: argparse.Namespace) -> int:
-    """Read changed files; return the exit code."""
-    outcome = fuzz(
-        arguments.inputs,
-        seed=arguments.seed,
-        first=arguments.first,
-        kinds=tuple(arguments.kind or SUBJECTS),
-        progress=lambda done: (
-            print(f"{done:,} inputs", flush=True) if done % 1000 == 0 else None
-        ),
-    )
-    for kind in SUBJECTS:
-        print(
-            f"{kind:<10} {outcome.read[kind]:>8,} read {outcome.refused[kind]:>8,} refused"
-        )
-    return _report(outcome.findings)
+def _run(
+    name: str,
+    count: int,
+    progress: Progress,
+    kinds: tuple[str, ...],
+    path: Path | None,
+) -> None:
+    """Run faults of one kind in blocks until there are as many as requested."""
+    fault, part = FAULTS[name], progress.parts[name]
+    while part.done < count:
+        block = min(fault.block, count - part.done)
+        part.add(fault.run(block, progress.seed, part.next, kinds))
+        save_progress(progress, path)
+        print(f"{name}: {part.done:,}, {len(part.findings)} findings", flush=True)
 
 
-def kills(arguments: argparse.Namespace) -> int:
-    """Kill processes; return the exit code."""
-    killed = kill(arguments.kills, seed=arguments.seed, first=arguments.first)
-    for kind, count in sorted(killed.runs.items()):
-        print(f"{count:>6,} {kind}")
-    print(f"{killed.n_signals:>6,} signals sent")
-    return _report(killed.findings)
-
-
-def calls(arguments: argparse.Namespace) -> int:
-    """Call public functions with wrong arguments; return the exit code."""
-    outcome = fuzz_calls(
-        arguments.calls,
-        seed=arguments.seed,
-        first=arguments.first,
-        progress=lambda done: (
-            print(f"{done:,} calls", flush=True) if done % 1000 == 0 else None
-        ),
-    )
+def _report(name: str, part: Part) -> None:
+    for kind, count in sorted(part.counts.items()):
+        print(f"{count:>9,} {kind}")
     print(
-        f"{len(outcome.functions)} functions: {outcome.returned:,} returned, {outcome.refused:,} refused"
+        f"{name}: {part.done:,}, {len(part.findings)} findings",
+        *part.findings,
+        sep="\n",
     )
-    return _report(outcome.findings)
-
-
-def flips(arguments: argparse.Namespace) -> int:
-    """Flip bits of files with checksums; return the exit code."""
-    flipped = flip_bits(arguments.flips, seed=arguments.seed, first=arguments.first)
-    for name, count in flipped.refused.items():
-        print(f"{count:>6,} flips of {name} refused")
-    return _report(flipped.findings)
-
-
-def stops(arguments: argparse.Namespace) -> int:
-    """Run random orders of requests; return the exit code."""
-    outcome = run_orders(
-        arguments.stops,
-        seed=arguments.seed,
-        first=arguments.first,
-        progress=lambda done: (
-            print(f"{done:,} orders", flush=True) if done % 100 == 0 else None
-        ),
-    )
-    return _report_stops(outcome)
-
-
-def moments(arguments: argparse.Namespace) -> int:
-    """Stop at hard moments; return the exit code."""
-    return _report_stops(stop_at_hard_moments(arguments.moments, seed=arguments.seed))
-
-
-def _report_stops(outcome: StopOutcome) -> int:
-    for kind, count in sorted(outcome.requests.items()):
-        print(f"{count:>8,} {kind}")
-    return _report(outcome.findings)
-
-
-RUNS = {
-    "inputs": inputs,
-    "kills": kills,
-    "calls": calls,
-    "flips": flips,
-    "stops": stops,
-    "moments": moments,
-}
-
-
-def _report(findings: list[str]) -> int:
-    print(f"{len(findings)} findings", *findings, sep="\n")
-    return 1 if findings else 0
 
 
 if __name__ == "__main__":

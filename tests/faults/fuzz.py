@@ -8,7 +8,7 @@ import sys
 import tempfile
 import traceback
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -51,7 +51,6 @@ def fuzz(
     seed: int = 0,
     first: int = 0,
     kinds: tuple[str, ...] = tuple(SUBJECTS),
-    progress: Callable[[int], None] | None = None,
 ) -> Outcome:
     """Read changed files of all kinds in turn.
 
@@ -60,7 +59,6 @@ def fuzz(
         seed: Seed; every input is a function of seed, index and kind.
         first: Index of the first input.
         kinds: Kinds of files.
-        progress: Called after every input with the number of inputs so far.
     """
     outcome = Outcome()
     with tempfile.TemporaryDirectory(prefix="cnpgen-faults-") as temporary:
@@ -77,8 +75,6 @@ def fuzz(
                     Path(temporary) / "given",
                     outcome,
                 )
-                if progress is not None:
-                    progress(number + 1 - first)
     return outcome
 
 

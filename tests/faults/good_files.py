@@ -22,6 +22,7 @@ from cnpgen.training.checkpoint import Checkpoints, start_state
 from tests.examples.models import boundary_of_columns, untrained_model
 from tests.examples.plan_files import plans_of, remove_checksum
 from tests.examples.plans import load as stored_plan
+from tests.faults.mesh_subjects import make_mesh_files
 from tests.faults.scene_subjects import make_scene_files
 
 IDENTITY = {"steps": 10}  # of the run of the checkpoint, the journal and the results
@@ -80,6 +81,8 @@ def make_good_files(folder: Path) -> None:
     journal.append([0], [attempt])
     journal.close()
     make_scene_files(folder)
+    (folder / "crane").mkdir()
+    make_mesh_files(folder / "crane")
 
 
 def _make_task_files(folder: Path) -> None:

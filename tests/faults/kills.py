@@ -19,6 +19,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from cnpgen.planner.model_file import load_model
+from cnpgen.store.files.atomic import file_sha256
 from cnpgen.validate.validate_dataset import validate_dataset
 from tests.cli.test_interruption import descendants
 from tests.examples.tiny_datasets import digests
@@ -36,11 +37,13 @@ class Kills:
 
     Attributes:
         n_signals: Number of sent signals.
+        n_runs: Number of runs.
         runs: Number of runs by kind and by exit code of the last killed process.
         findings: Failures, one line each.
     """
 
     n_signals: int = 0
+    n_runs: int = 0
     runs: Counter[str] = field(default_factory=Counter)
     findings: list[str] = field(default_factory=list)
 
@@ -135,6 +138,19 @@ def _train(folder: Path, _workers: int) -> list[str]:
     ]
 
 
+def _publish(folder: Path, _workers: int) -> list[str]:
+    dataset, out = folder.parent / "shared" / "small", folder / "hub"
+    return ["publish", str(dataset), "--to", "lab/hits", "--dry-run", "-o", str(out)]
+
+
+def _repository(folder: Path) -> object:
+    """Return the digests of all files of a repository, without temporary ones."""
+    files = sorted(path for path in (folder / "hub").rglob("*") if path.is_file())
+    names = [path.relative_to(folder).as_posix() for path in files]
+    assert not any(name.endswith((".tmp", ".part")) for name in names), names
+    return {name: file_sha256(path) for name, path in zip(names, files, strict=True)}
+
+
 def _dataset(folder: Path) -> object:
     """Return the digests of the shards of a dataset, which must be valid and without temporary files."""
     assert validate_dataset(folder / "out").ok
@@ -173,6 +189,7 @@ KINDS = {
     "solve": Kind(_nothing, _solve, _plans, (0, 1)),
     "refine": Kind(_unrefined, _refine, _refined, (0, 1)),
     "train": Kind(_nothing, _train, _model),
+    "publish": Kind(_nothing, _publish, _repository),
 }
 
 
@@ -212,6 +229,7 @@ def kill(
                 outcome.n_signals += 1
             shutil.rmtree(folder)
             number += 1
+            outcome.n_runs += 1
     return outcome
 
 

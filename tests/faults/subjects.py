@@ -55,6 +55,7 @@ from tests.examples.plan_files import plans_of
 from tests.examples.plans import load as stored_plan
 from tests.examples.urdf_reading import bodies_in, differences
 from tests.faults.good_files import IDENTITY
+from tests.faults.mesh_subjects import change_mesh, change_srdf, read_shaped_robot
 from tests.faults.mutations import (
     change_bytes,
     change_json,
@@ -586,6 +587,8 @@ SUBJECTS: dict[str, Subject] = {
     "scenes": Subject(change_scene, read_scene),
     "trajectory": Subject(change_trajectory, read_trajectory),
     "scene-plans": Subject(_change_scene_plans, read_scene_plans),
+    "mesh": Subject(change_mesh, read_shaped_robot),
+    "srdf": Subject(change_srdf, read_shaped_robot),
 }
 
 

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from cnpgen.addons.benchmark.results_file import open_results
 from cnpgen.addons.online.moving_pucks import PuckModel
 from cnpgen.errors import MAX_LINE_LENGTH, DatasetError, RecipeError, UsageError
 from cnpgen.plans import PlanStatus, load_plans, save_plans
@@ -171,3 +172,10 @@ def test_a_goal_region_without_a_size_and_an_orientation_that_is_a_number(
     (tmp_path / "request1.yaml").write_text(REQUEST.replace(old, new), encoding="utf-8")
     with pytest.raises(SceneError, match=message):
         load_scenes(tmp_path)
+
+
+def test_an_answer_in_a_row_of_results_without_its_ending(tmp_path: Path) -> None:
+    results = open_results(tmp_path / "results.jsonl", {"steps": 10})
+    results.append({"problem": 0, "answer": {"t": ["0,5"], "q": [[0.0]]}})
+    with pytest.raises(DatasetError, match="is damaged: line 2: "):
+        open_results(tmp_path / "results.jsonl", {"steps": 10})

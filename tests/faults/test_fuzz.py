@@ -1,11 +1,14 @@
 """A small run of ``python -m tests.faults``: changed files of every kind give results or CnpgenErrors."""
 
+from collections import Counter
 from pathlib import Path
 from random import Random
 from typing import Any
 
 import pytest
 
+from cnpgen.problems import problem
+from cnpgen.robots.shape import inline
 from tests.faults import mutations, scene_subjects, subjects
 from tests.faults.fuzz import Outcome, fuzz
 from tests.faults.good_files import make_good_files
@@ -72,3 +75,27 @@ def test_files_of_every_kind_are_read_unchanged(
         folder.mkdir()
         SUBJECTS[kind].change(good, folder, draw)
         read_quietly(SUBJECTS[kind], folder, draw)
+
+
+def test_changed_meshes_and_srdf_files_reach_their_readers(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    calls: Counter[str] = Counter()
+
+    def counted(read: Any) -> Any:
+        def reading(*arguments: Any) -> Any:
+            calls[read.__name__] += 1
+            return read(*arguments)
+
+        return reading
+
+    monkeypatch.setattr(inline, "read_mesh", counted(inline.read_mesh))
+    srdf = problem.with_disabled_pairs
+    monkeypatch.setattr(problem, "with_disabled_pairs", counted(srdf))
+    meshes = fuzz(30, seed=4, kinds=("mesh",))
+    assert calls["read_mesh"] >= 30
+    assert calls["with_disabled_pairs"] == meshes.read["mesh"] > 0
+    pairs = fuzz(30, seed=4, kinds=("srdf",))
+    assert calls["with_disabled_pairs"] == meshes.read["mesh"] + 30
+    assert min(meshes.refused["mesh"], pairs.read["srdf"], pairs.refused["srdf"]) > 0
+    assert meshes.findings + pairs.findings == []

@@ -11,6 +11,9 @@ from tests.faults.kills import KINDS, kill
 @pytest.mark.skipif(not Path("/proc/self/task").is_dir(), reason="needs /proc")
 @pytest.mark.parametrize("kind", KINDS)
 def test_killed_and_resumed_runs_give_the_result_of_an_uninterrupted_run(kind):
+    if kind == "publish":
+        pytest.importorskip("pyarrow")
+        pytest.importorskip("matplotlib")
     killed = kill(2, seed=1, kinds=(kind,))
     assert killed.findings == []
     assert killed.n_signals >= 2

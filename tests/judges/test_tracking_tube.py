@@ -57,7 +57,7 @@ def test_no_state_within_the_tube_violates_more_than_the_verdict_states(
     assert len(checked) >= 2
 
 
-@pytest.mark.parametrize("error", [5e-5, 1e-4, 2e-4])
+@pytest.mark.parametrize("error", [5e-5, 2e-4, 7e-4])
 def test_the_contact_of_a_hit_is_intended_within_the_tube(error: float) -> None:
     plan, random = load("hit"), np.random.default_rng(5)
     verdict = plan.judged(tracking_error=error)
@@ -77,7 +77,7 @@ def test_the_contact_of_a_hit_is_intended_within_the_tube(error: float) -> None:
         )
         displacement = np.linalg.norm(world.tip_position - planned, axis=0).max()
         distances = contact.distances_from_contact_region(world)
-        assert distances[touches].max(initial=0) <= 2 * displacement + 1e-4
+        assert distances[touches].max(initial=0) <= 3 * displacement + 1e-4
         touched += touches.sum()
     assert touched  # a hit touches the puck at its end
 

@@ -12,13 +12,13 @@ from cnpgen.kernels.compiled_kernel import CompiledGridKernel
 from cnpgen.kernels.interpreted_kernel import (
     POINTS_PER_BLOCK,
     InterpretedGridKernel,
-    MappedGridKernel,
 )
 from cnpgen.kernels.kernel import GridKernel
 from cnpgen.kernels.library import KernelLibrary
 from cnpgen.kernels.lowering import lower
 from cnpgen.kernels.tape import Axes, GridSpec, Loop, Tape, tape_from_function
 from tests.conftest import needs_compiler
+from tests.examples.casadi_kernels import MappedGridKernel
 from tests.kernels.test_kernels import BINARY, REFERENCE, SPECIAL, UNARY
 
 Array = np.ndarray

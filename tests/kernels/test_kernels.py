@@ -22,12 +22,12 @@ from cnpgen.kernels.compiled_kernel import CompiledKernel
 from cnpgen.kernels.interpreted_kernel import (
     POINTS_PER_BLOCK,
     InterpretedKernel,
-    MappedKernel,
 )
 from cnpgen.kernels.kernel import Kernel
 from cnpgen.kernels.library import KernelLibrary, choose_backend
 from cnpgen.kernels.tape import CODES, NAMES, Loop, Tape, tape_from_function
 from tests.conftest import Prepare, needs_compiler, some
+from tests.examples.casadi_kernels import MappedKernel
 
 Array = np.ndarray
 
@@ -726,12 +726,12 @@ def test_a_cached_tape_has_the_read_permissions_of_the_umask(tmp_path):
 def test_unknown_backends_are_refused(own_cache):
     with pytest.raises(
         UsageError,
-        match="'cuda' does not exist: expected one of compiled, numpy, casadi",
+        match="'cuda' does not exist: expected one of compiled, numpy",
     ):
         choose_backend("cuda")
 
 
-@pytest.mark.parametrize("wanted", ["compiled", "numpy", "casadi"])
+@pytest.mark.parametrize("wanted", ["compiled", "numpy"])
 def test_backends_need_no_compiler(own_cache, monkeypatch, wanted):
     monkeypatch.setenv("PATH", "")
     monkeypatch.delenv("CC", raising=False)

@@ -8,12 +8,12 @@ from cnpgen.kernels.collision.tree_search import TreeSettings, find_tree_path
 from cnpgen.problems.load_robot import load_robot
 from cnpgen.problems.problem_file import load_problem
 from cnpgen.refine.refiner import Refiner
-from cnpgen.refine.solver.hulls import Hulls
 from cnpgen.refine.strategy import PlanChecker, refine_task
 from cnpgen.robots.solid import place_obstacles
 from cnpgen.trajectory.spline_motion import Motion
 from cnpgen.world.world import World
 from tests.conftest import needs_compiler
+from tests.examples.coal_hulls import CoalHulls
 from tests.examples.narrow import BESIDE_WALL, LIMITS, SLOT, WALL, between
 from tests.examples.shaped_robot import write_problem
 
@@ -93,8 +93,8 @@ def test_paths_keep_the_height_and_are_clear_by_coal(setting, margin):
     assert (path >= setting.robot.position_lower).all()
     assert (path <= setting.robot.position_upper).all()
     distances = (
-        Hulls(setting.problem, setting.robot)
-        .measure(path[1:-1].T.copy(), setting.poses)[0]
+        CoalHulls(setting.problem, setting.robot)
+        .measure(path[1:-1].T.copy(), setting.poses)
         .min(axis=1)
     )
     away = (
@@ -105,7 +105,7 @@ def test_paths_keep_the_height_and_are_clear_by_coal(setting, margin):
     assert distances[away].min() >= margin - 1e-6
     line = np.linspace(*setting.ends, 100)
     assert (
-        not Hulls(setting.problem, setting.robot)
+        not CoalHulls(setting.problem, setting.robot)
         .clear_states(line.T.copy(), setting.poses)
         .all()
     )

@@ -16,9 +16,9 @@ from cnpgen.kernels.collision.tree_search import (
 )
 from cnpgen.kernels.library import KernelLibrary, choose_backend
 from cnpgen.problems.load_robot import load_robot
-from cnpgen.refine.solver.hulls import Hulls
 from cnpgen.robots.solid import place_obstacles
 from tests.conftest import needs_compiler
+from tests.examples.coal_hulls import CoalHulls
 from tests.examples.narrow import BESIDE_WALL, WALL, narrow
 
 pytestmark = needs_compiler
@@ -65,7 +65,7 @@ def test_paths_around_a_wall_are_clear_by_coal(setting, margin):
     assert len(path) > 2
     np.testing.assert_array_equal(path[[0, -1]], BESIDE_WALL)
     q, poses = along(path), place_obstacles(problem.obstacle)
-    distances = Hulls(problem, robot).measure(q, poses)[0].min(axis=1)
+    distances = CoalHulls(problem, robot).measure(q, poses).min(axis=1)
     away = (
         np.minimum(*(np.abs(q.T - end).max(axis=1) for end in BESIDE_WALL))
         > TreeSettings(0.0, 0.0).margin_ramp
@@ -73,7 +73,7 @@ def test_paths_around_a_wall_are_clear_by_coal(setting, margin):
     assert distances.min() > -0.004  # between checked states
     assert distances[away].min() > margin - 0.004
     assert (
-        not Hulls(problem, robot)
+        not CoalHulls(problem, robot)
         .clear_states(np.linspace(*BESIDE_WALL, 100).T.copy(), poses)
         .all()
     )

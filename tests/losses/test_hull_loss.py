@@ -3,10 +3,7 @@
 import numpy as np
 import pytest
 
-from cnpgen.kernels.collision.clearance_loss import (
-    ClearanceLossReference,
-    load_clearance_loss,
-)
+from cnpgen.kernels.collision.clearance_loss import ClearanceLoss
 from cnpgen.kernels.collision.collision_checker import (
     CollisionChecker,
     load_collision_library,
@@ -23,6 +20,7 @@ from cnpgen.robots.shape.convex_part import turned
 from cnpgen.robots.shape.hull import CUBE
 from cnpgen.robots.solid import number_slices, place_obstacles
 from tests.conftest import needs_compiler
+from tests.examples.clearance_reference import ClearanceLossReference
 from tests.examples.shaped_robot import write_problem
 
 pytestmark = needs_compiler
@@ -76,7 +74,7 @@ def states(robot, count: int) -> np.ndarray:
 def test_losses_of_states_are_those_of_measured_distances(problem):
     robot, kernels = load_robot(problem), KernelLibrary(*choose_backend("compiled"), "")
     q, bodies = states(robot, 200), scene_primitives([SCENE])
-    losses, gradients = load_clearance_loss(kernels, robot)(
+    losses, gradients = ClearanceLoss(load_collision_library(kernels), robot)(
         q[:, :, None], bodies, REQUIRED
     )
     checker = CollisionChecker(load_collision_library(kernels), robot)
@@ -88,7 +86,7 @@ def test_losses_of_states_are_those_of_measured_distances(problem):
         losses[:, 0], expected, rtol=2e-2, atol=1e-5
     )  # cylinders there contain the judges' prism
     step, e = np.random.default_rng(1).normal(size=q.shape), 1e-6
-    loss = load_clearance_loss(kernels, robot)
+    loss = ClearanceLoss(load_collision_library(kernels), robot)
     above, below = (
         loss((q + s * e * step)[:, :, None], bodies, REQUIRED)[0] for s in (1, -1)
     )
@@ -108,7 +106,9 @@ def test_losses_of_states_are_those_of_pinocchio_and_coal(problem):
         scene_primitives([SCENE] * 100 + [SCENE[:2]] * 20),
     )
     q[0, 0, 7] = np.nan
-    losses, gradients = load_clearance_loss(kernels, robot)(q, obstacles, REQUIRED)
+    losses, gradients = ClearanceLoss(load_collision_library(kernels), robot)(
+        q, obstacles, REQUIRED
+    )
     expected, derivatives = ClearanceLossReference(robot)(q, obstacles, REQUIRED)
     assert (expected > 0).mean() > 0.1
     np.testing.assert_allclose(losses, expected, rtol=1e-4, atol=1e-7)
@@ -117,7 +117,7 @@ def test_losses_of_states_are_those_of_pinocchio_and_coal(problem):
     assert np.isnan([losses[0, 7], expected[0, 7]]).all()
 
 
-def test_without_compiled_kernels_the_loss_of_plans_is_the_same(problem):
+def test_with_interpreted_kernels_the_loss_of_plans_is_the_same(problem):
     full = with_capacity(
         problem.with_obstacles(()), dict.fromkeys(map(shape_of, SCENE), 1)
     )

@@ -167,17 +167,15 @@ def test_budgets_and_first_weights_come_from_the_problem_file():
 @pytest.mark.parametrize("dtype", ["float32", "float64"])
 def test_without_a_compiler_the_loss_is_the_same_up_to_rounding(name, dtype):
     given = batch(LABEL_OF[name], 5)
-    kinds = ["numpy", "casadi"] if dtype == "float64" else ["numpy"]
     reference = given.evaluated(loss(name, dtype=dtype))
-    for backend in kinds:
-        value = given.evaluated(loss(name, dtype=dtype, backend=backend))
-        tolerance = 1e-10 if dtype == "float64" else 2e-4
-        for field_name in ("total", "terms", "path_gradient", "rate_gradient"):
-            found, expected = getattr(value, field_name), getattr(reference, field_name)
-            assert found.dtype == expected.dtype == dtype
-            np.testing.assert_allclose(
-                found, expected, rtol=tolerance, atol=tolerance * np.abs(expected).max()
-            )
+    value = given.evaluated(loss(name, dtype=dtype, backend="numpy"))
+    tolerance = 1e-10 if dtype == "float64" else 2e-4
+    for field_name in ("total", "terms", "path_gradient", "rate_gradient"):
+        found, expected = getattr(value, field_name), getattr(reference, field_name)
+        assert found.dtype == expected.dtype == dtype
+        np.testing.assert_allclose(
+            found, expected, rtol=tolerance, atol=tolerance * np.abs(expected).max()
+        )
 
 
 @pytest.mark.parametrize("n", [0, 1, 2, 15, 16, 17, 127, 128, 129, 300])

@@ -17,6 +17,7 @@ from cnpgen.robots.solid import place_obstacles, solids_of
 from cnpgen.scenes import (
     GoalPose,
     SceneError,
+    SceneOptions,
     SceneProblem,
     load_scenes,
     save_scenes,
@@ -237,3 +238,58 @@ def test_the_command_names_what_is_missing(
     assert main(["solve", str(tmp_path / "none.h5"), "--robot", "panda"]) == 2
     assert "no such file" in capsys.readouterr().err
     assert len(load_scenes(tmp_path / "scenes.h5")) == 1
+
+
+def test_earlier_plans_are_initial_guesses_for_moved_obstacles(crane: Path) -> None:
+    before = solve_scenes(crane, SCENES, workers=1)
+    post = replace(POST, position=(0.61, 0.01, 0.25))
+    moved = [
+        replace(
+            scene,
+            obstacles=tuple(post if o is POST else o for o in scene.obstacles),
+        )
+        for scene in SCENES
+    ]
+    scratch = solve_scenes(crane, moved, workers=1)
+    after = solve_scenes(
+        crane, moved, workers=1, run=SceneOptions(initial=before.plans)
+    )
+    assert after.valid.all()
+    assert all(v.valid for v in cnpgen.evaluate_plans(after.plans, workers=1).verdicts)
+    # The obstacles are those of the new scenes.
+    np.testing.assert_array_equal(
+        after.plans.columns["obstacle_poses"], scratch.plans.columns["obstacle_poses"]
+    )
+    steps = [sum(result.iterations for result in found.results) for found in (after, scratch)]  # fmt: skip
+    assert steps[0] < steps[1] / 2
+    assert (after.plans.duration < 1.02 * scratch.plans.duration).all()
+    with pytest.raises(UsageError, match="one plan for each of 3 scenes"):
+        solve_scenes(crane, moved, run=SceneOptions(initial=before.plans[:2]))
+
+
+def test_segments_with_smooth_stops_are_joined(crane: Path) -> None:
+    back = replace(SCENES[0], name="back", start_q=GOAL, goal_q=START[None])
+    run = SceneOptions(smooth_stop=True)
+    solved = solve_scenes(crane, [SCENES[0], back], workers=1, run=run)
+    assert solved.valid.all()
+    end = solved.plans.motion.at(np.ones(1))
+    np.testing.assert_allclose(end.ddq, 0, atol=1e-6)
+    joined = cnpgen.join_plans(solved.plans[:1], solved.plans[1:])
+    assert joined.duration == pytest.approx(solved.plans.duration.sum())
+
+
+def test_the_command_starts_from_earlier_plans_and_stops_smoothly(
+    crane: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    scenes, old, new = (tmp_path / name for name in ("scenes.h5", "old.h5", "new.h5"))
+    save_scenes(scenes, SCENES[:1])
+    command = ["solve", str(scenes), "--robot", str(crane), "--workers", "1"]
+    assert main([*command, "--smooth-stop", "-o", str(old)]) == 0
+    plans = cnpgen.load_plans(old)
+    np.testing.assert_allclose(plans.motion.at(np.ones(1)).ddq, 0, atol=1e-6)
+    assert main([*command, "--initial-plans", str(old), "-o", str(new)]) == 0
+    capsys.readouterr()
+    assert main([*command, "--initial-plans", str(old), "-o", str(new)]) == 0
+    assert "already" in capsys.readouterr().err
+    assert main(["solve", "airhockey-hit", "--n", "1", "--smooth-stop"]) == 2
+    assert "--robot" in capsys.readouterr().err

@@ -14,18 +14,13 @@ from cnpgen.robots.solid import place_obstacles
 from cnpgen.world.path import PathWorld
 from tests.conftest import SHIPPED, Prepare, needs_compiler, run_stages, some
 
-BACKENDS = [pytest.param("compiled", marks=needs_compiler), "numpy", "casadi"]
+BACKENDS = [pytest.param("compiled", marks=needs_compiler), "numpy"]
 NO_NUMBERS = [
     *(
         pytest.param("compiled", value, marks=needs_compiler)
         for value in (np.nan, np.inf, -np.inf)
     ),
     *(("numpy", value) for value in (np.nan, np.inf, -np.inf)),
-    ("casadi", np.nan),
-    *(
-        pytest.param("casadi", value, marks=pytest.mark.extended)
-        for value in (np.inf, -np.inf)
-    ),
 ]
 STATES = [
     f"{end}_{what}" for end in ("start", "goal") for what in ("q", "dq", "ddq", "xyz")

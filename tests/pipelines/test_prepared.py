@@ -309,7 +309,7 @@ def same_round(prepared: PreparedPipeline, size: int) -> CandidateBatch:
 @pytest.mark.parametrize("name", some(SHIPPED, 1, "slow"))
 @pytest.mark.parametrize(
     ("backend", "size"),
-    [pytest.param("compiled", 6000, marks=needs_compiler), ("casadi", 300)],
+    [pytest.param("compiled", 6000, marks=needs_compiler), ("numpy", 300)],
 )
 def test_backends_agree_on_the_same_candidates(prepare: Prepare, name, backend, size):
     """Exceptions are candidates close to a rejection limit and searches with two equal optima."""

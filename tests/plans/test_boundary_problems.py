@@ -286,7 +286,7 @@ def test_solve_makes_plans_for_a_file_of_boundary_conditions(
         ),
         (
             ["airhockey-hit", "--n", "1", "--problem", "airhockey"],
-            "--problem is for boundary conditions in HDF5",
+            "--problem and --extrapolate are for boundary conditions in HDF5",
         ),
         (["empty.h5", "--problem", "airhockey"], "no boundary conditions in empty.h5"),
     ],

@@ -13,16 +13,18 @@ from cnpgen.kernels import c_library
 from cnpgen.kernels.library import KernelLibrary, problem_kernels
 from cnpgen.problems.load_robot import load_robot
 from cnpgen.refine.refiner import Refiner
-from cnpgen.refine.solver import compiled_backend, qp_subproblem
+from cnpgen.refine.solver import compiled_backend, sqp
 from cnpgen.refine.solver.compiled_backend import CompiledBackend
-from cnpgen.refine.solver.qp_subproblem import NumpyBackend, ResidualSelection
+from cnpgen.refine.solver.qp_subproblem import ResidualSelection
 from cnpgen.refine.strategy import PlanChecker, refine_task
 from cnpgen.refine.task import RefinementTask
 from cnpgen.robots.scene import Scene
 from cnpgen.trajectory.boundary import Boundary
 from cnpgen.trajectory.trajectory_spec import TrajectorySpec
 from tests.conftest import some
+from tests.examples import numpy_solver
 from tests.examples.chains import chain
+from tests.examples.numpy_solver import NumpyBackend
 from tests.examples.plans import Plan, load
 from tests.examples.refiner import library, needs_compiler, task
 
@@ -45,7 +47,7 @@ def with_goal_acceleration(plan: Plan, constrained: bool) -> Boundary:
 
 def use_tight_tolerance(monkeypatch: pytest.MonkeyPatch) -> None:
     """Reduce the tolerance of both solvers, so that they end at the same point."""
-    for module in (qp_subproblem, compiled_backend):
+    for module in (numpy_solver, compiled_backend):
         monkeypatch.setattr(module, "QP_TOLERANCE", 1e-10)
 
 
@@ -196,30 +198,26 @@ def test_no_memory_is_overwritten_with_narrower_vectors_and_all_residuals(
 )
 @pytest.mark.parametrize("label", some(LABELS, 2, "slow"))
 def test_plans_are_as_good_as_those_of_numpy_and_daqp(
-    label: str, with_input: bool
+    label: str, with_input: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     plan = load(label)
     tool, checker = refiner_of(plan), PlanChecker(plan.problem, plan.robot, degree=7)
-    plain = refiner_of(plan)
-    plain.residual_kernels = replace(plain.residual_kernels, step_library=None)
     input_plan = (
         {"path": plan.motion.path[0] + 0.01, "rate": 1.02 * plan.motion.rate[0]}
         if with_input
         else {}
     )
-    fast, slow = (
-        refine_task(refiner, checker, task(plan, **input_plan))
-        for refiner in (tool, plain)
-    )
+    fast = refine_task(tool, checker, task(plan, **input_plan))
+    monkeypatch.setattr(sqp, "CompiledBackend", NumpyBackend)
+    slow = refine_task(refiner_of(plan), checker, task(plan, **input_plan))
     assert fast.valid
     assert slow.valid
     assert fast.cost == pytest.approx(slow.cost, rel=2e-4)
 
 
-def test_daqp_solves_programs_with_too_many_working_set_changes(
+def test_a_program_with_too_many_working_set_changes_has_no_step(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    use_tight_tolerance(monkeypatch)
     plan = load("replan")
     tool, problem = refiner_of(plan), task(plan)
     motion = tool.transcription(problem, tool.levels.coarse)
@@ -233,14 +231,23 @@ def test_daqp_solves_programs_with_too_many_working_set_changes(
         backend.subproblem(x, g, selection, proximal=0.02, penalty=2.0),
         np.full(motion.nx, 0.1),
     )
-    expected = model.solve(box)
+    assert model.solve(box) is not None
     monkeypatch.setattr(compiled_backend, "MAX_WORKING_SET_CHANGES", 1)
-    assert backend.solve(model, box, None, relax=False) is None
-    np.testing.assert_allclose(model.solve(box).dx, expected.dx, atol=1e-7)
+    assert model.solve(box) is None
 
 
-def test_without_compiled_kernels_the_numpy_backend_is_used(tmp_path) -> None:
+def test_interpreted_kernels_are_called_from_compiled_code(tmp_path) -> None:
     plan = load("hit")
     kernels = problem_kernels(plan.problem, plan.robot, "numpy", tmp_path)
-    assert compiled_backend.load_step_library(kernels) is None
-    assert refiner_of(plan).residual_kernels.step_library is not None
+    tools = refiner_of(plan), Refiner(plan.problem, plan.robot, kernels=kernels)
+    results = []
+    for tool in tools:
+        motion = tool.transcription(task(plan), tool.levels.coarse)
+        bounds = tool.bounds(task(plan), tool.levels.coarse, motion.end_residuals())
+        results.append(
+            CompiledBackend(motion, bounds).value(tool.line_guess(task(plan)))
+        )
+    (cost, g, violation), (expected_cost, expected_g, expected_violation) = results
+    assert cost == pytest.approx(expected_cost, rel=1e-9)
+    np.testing.assert_allclose(g, expected_g, atol=1e-9 * np.abs(expected_g).max())
+    assert violation == pytest.approx(expected_violation, rel=1e-9)

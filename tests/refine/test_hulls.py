@@ -7,9 +7,8 @@ import numpy as np
 import pytest
 import scipy
 
-from cnpgen.kernels.collision.collision_checker import load_collision_library
 from cnpgen.kernels.collision.tree_search import TreeSettings
-from cnpgen.kernels.library import KernelLibrary, choose_backend
+from cnpgen.kernels.library import choose_backend, problem_kernels
 from cnpgen.problems.constraints.clearance import RobotClearance
 from cnpgen.problems.load_robot import load_robot
 from cnpgen.problems.problem_file import load_problem
@@ -17,11 +16,7 @@ from cnpgen.refine import attempts, rrt_connect
 from cnpgen.refine import refiner as refiner_module
 from cnpgen.refine.refiner import Refiner
 from cnpgen.refine.solver.hull_levels import HullFeedback
-from cnpgen.refine.solver.hulls import (
-    MEASURED_RANGE_M,
-    Hulls,
-    has_clearance_constraints,
-)
+from cnpgen.refine.solver.hulls import MEASURED_RANGE_M, has_clearance_constraints
 from cnpgen.refine.solver.sqp import DEFAULT_SETTINGS
 from cnpgen.refine.strategy import PlanChecker, RefinementSearch, refine_task
 from cnpgen.refine.task import Outcome
@@ -29,6 +24,7 @@ from cnpgen.robots.solid import place_obstacles
 from cnpgen.trajectory.spline_motion import Motion
 from cnpgen.world.world import World
 from tests.conftest import needs_compiler
+from tests.examples.coal_hulls import CoalHulls, compiled_hulls
 from tests.examples.meshes import Meshes
 from tests.examples.narrow import (
     BESIDE_WALL,
@@ -57,50 +53,22 @@ CONTACT_TURN_RAD, CONTACT_M, CLOSE_M = (
 )  # the contact is half the tolerance
 
 
-@pytest.fixture(params=["coal", pytest.param("compiled", marks=needs_compiler)])
-def library(request):
-    if request.param == "coal":
-        return None
-    return load_collision_library(KernelLibrary(*choose_backend("compiled"), "", {}))
+@pytest.fixture(params=["coal", "compiled"])
+def make_hulls(request):
+    return {"coal": CoalHulls, "compiled": compiled_hulls}[request.param]
 
 
-@pytest.mark.parametrize("obstacles", [KINDS, OBSTACLES], ids=["kinds", "boxes"])
-def test_gradients_are_those_of_finite_differences(tmp_path, obstacles, library):
-    problem = load_problem(write_problem(tmp_path, obstacles=obstacles))
-    robot = load_robot(problem)
-    hulls, obstacle_poses = (
-        Hulls(problem, robot, library),
-        place_obstacles(problem.obstacle),
-    )
-    q = (
-        np.random.default_rng(0)
-        .uniform(robot.position_lower, robot.position_upper, (40, robot.n))
-        .T.copy()
-    )
-    distances, contacts = hulls.measure(q, obstacle_poses)
-    gradients = hulls.gradients(q, distances, contacts)
-    compared = 0
-    for joint, step in enumerate(STEP * np.eye(robot.n)[..., None]):
-        ends = [hulls.measure(q + side * step, obstacle_poses)[0] for side in (1, -1)]
-        near = (
-            np.array([distances, *ends]) < hulls.min_distances + MEASURED_RANGE_M
-        ).all(axis=0)
-        found = (ends[0] - ends[1]) / (2 * STEP)
-        assert np.abs(found - gradients[joint].T)[near].max() < 1e-6
-        compared += near.sum()
-    assert compared > 150
-
-
-def test_distances_agree_with_meshes(tmp_path, library):
+@needs_compiler
+def test_distances_agree_with_meshes(tmp_path, make_hulls):
     problem = load_problem(write_problem(tmp_path))
     robot = load_robot(problem)
-    hulls, meshes = Hulls(problem, robot, library), Meshes(problem, robot, tmp_path)
+    hulls, meshes = make_hulls(problem, robot), Meshes(problem, robot, tmp_path)
     q = np.random.default_rng(1).uniform(
         robot.position_lower, robot.position_upper, (400, robot.n)
     )
     obstacle_poses = place_obstacles(problem.obstacle)
     expected = np.array([min(meshes.distances(state)) for state in q])
-    found = hulls.measure(q.T.copy(), obstacle_poses)[0].min(axis=1)
+    found = hulls.measure(q.T.copy(), obstacle_poses).min(axis=1)
     in_range = (expected > 0) & (expected < MEASURED_RANGE_M)
     assert in_range.sum() > 15
     assert np.abs(found - expected)[in_range].max() < 1e-4  # round parts are prisms
@@ -113,18 +81,22 @@ def test_distances_agree_with_meshes(tmp_path, library):
     assert allowed == pytest.approx(-found.min() - 1e-4, abs=1e-9)
 
 
-def test_distances_of_positions_that_are_not_finite_are_nan(tmp_path, library):
+@needs_compiler
+def test_distances_of_positions_that_are_not_finite_are_nan(tmp_path, make_hulls):
     problem = load_problem(write_problem(tmp_path))
     robot = load_robot(problem)
     q = np.where(np.arange(3) == 1, np.nan, 0.0) + np.zeros((robot.n, 1))
     assert np.isnan(
-        Hulls(problem, robot, library).measure(q, place_obstacles(problem.obstacle))[0]
+        make_hulls(problem, robot).measure(q, place_obstacles(problem.obstacle))
     ).all()
 
 
 @needs_compiler
-def test_compiled_rows_are_the_distances_of_hulls_and_their_gradients(tmp_path):
-    problem = load_problem(write_problem(tmp_path, obstacles=KINDS))
+@pytest.mark.parametrize("obstacles", [KINDS, OBSTACLES], ids=["kinds", "boxes"])
+def test_compiled_rows_are_the_distances_of_hulls_and_their_gradients(
+    tmp_path, obstacles
+):
+    problem = load_problem(write_problem(tmp_path, obstacles=obstacles))
     robot, tool = load_robot(problem), Refiner(problem, load_robot(problem))
     kernels, poses = tool.residual_kernels, place_obstacles(problem.obstacle)
     hulls, width, rows = (
@@ -143,7 +115,7 @@ def test_compiled_rows_are_the_distances_of_hulls_and_their_gradients(tmp_path):
     (values,) = with_rows.values(w, scene)
     again, jacobian = with_rows.jacobian(w, scene)
     own, own_jacobian = kernels.jacobian(w, scene)
-    distances, contacts = Hulls(problem, robot).measure(q, poses)  # by Coal
+    distances = CoalHulls(problem, robot).measure(q, poses)
     np.testing.assert_allclose(values[:rows], own, rtol=1e-12)
     np.testing.assert_allclose(
         values, again, atol=1e-9
@@ -160,11 +132,17 @@ def test_compiled_rows_are_the_distances_of_hulls_and_their_gradients(tmp_path):
     np.testing.assert_allclose(
         jacobian[:, :rows], own_jacobian.reshape(width, rows, 40), rtol=1e-12
     )
-    measured, contacts = hulls.measure(q, poses)
-    gradients = hulls.gradients(q, measured, contacts)
-    np.testing.assert_allclose(
-        0.1 * jacobian[: robot.n, rows:], gradients, atol=1e-4
-    )  # of curved bodies
+    gradients = 0.1 * jacobian[: robot.n, rows:]
+    compared = 0
+    for joint, step in enumerate(STEP * np.eye(robot.n)[..., None]):
+        ends = [hulls.measure(q + side * step, poses).T for side in (1, -1)]
+        close = (np.array(ends) < hulls.min_distances[:, None] + MEASURED_RANGE_M).all(
+            axis=0
+        ) & near
+        found = (ends[0] - ends[1]) / (2 * STEP)
+        assert np.abs(found - gradients[joint])[close].max() < 1e-4  # of curved bodies
+        compared += close.sum()
+    assert compared > 150
     assert not jacobian[robot.n :, rows:].any()
     assert np.abs(gradients).max() > 0.1
 
@@ -192,15 +170,16 @@ tolerance = 1e-3
 """
 
 
+@needs_compiler
 @pytest.mark.parametrize("obstacles", [KINDS, OBSTACLES], ids=["kinds", "boxes"])
 def test_distances_of_the_held_object_are_those_of_the_verdict(
-    tmp_path, obstacles, library
+    tmp_path, obstacles, make_hulls
 ):
     problem = load_problem(write_problem(tmp_path, obstacles=obstacles, more=HELD))
     robot, poses = load_robot(problem), place_obstacles(problem.obstacle)
     hulls, links = (
-        Hulls(problem, robot, library, with_object=True),
-        Hulls(problem, robot, library),
+        make_hulls(problem, robot, with_object=True),
+        make_hulls(problem, robot),
     )
     count = len(links.min_distances)
     held, beside = (
@@ -225,9 +204,9 @@ def test_distances_of_the_held_object_are_those_of_the_verdict(
         expected.append(world.object_distances())
         around.append(min(world.held_object_distances()))
     expected, around = np.array(expected), np.array(around)
-    found = hulls.measure(q.T.copy(), poses)[0]
+    found = hulls.measure(q.T.copy(), poses)
     np.testing.assert_allclose(
-        found[:, : held.start], links.measure(q.T.copy(), poses)[0], atol=1e-12
+        found[:, : held.start], links.measure(q.T.copy(), poses), atol=1e-12
     )
     assert (
         np.abs(found[:, held] - np.minimum(expected, MEASURED_RANGE_M - 0.002)).max()
@@ -278,6 +257,24 @@ def test_an_end_within_the_tolerance_of_a_contact_is_accepted(tmp_path):
 
 
 @needs_compiler
+def test_rows_of_distances_follow_those_of_interpreted_kernels(tmp_path):
+    problem = load_problem(write_problem(tmp_path, obstacles=KINDS))
+    robot, poses = load_robot(problem), place_obstacles(problem.obstacle)
+    numpy = problem_kernels(problem, robot, *choose_backend("numpy"))
+    tools = Refiner(problem, robot), Refiner(problem, robot, kernels=numpy)
+    random = np.random.default_rng(2)
+    w = random.uniform(0.1, 1.0, (tools[0].residual_kernels.values.tape.inputs[0], 30))
+    compiled, interpreted = (
+        tool.hulls.row_kernels(tool.residual_kernels, poses).jacobian(
+            w, np.zeros((0, 30))
+        )
+        for tool in tools
+    )
+    for found, expected in zip(interpreted, compiled, strict=True):
+        np.testing.assert_allclose(found, expected, rtol=1e-9, atol=1e-9)
+
+
+@needs_compiler
 def test_compiled_rows_of_the_held_object_have_its_depth(tmp_path):
     problem = load_problem(write_problem(tmp_path, more=HELD))
     robot = load_robot(problem)
@@ -292,7 +289,7 @@ def test_compiled_rows_of_the_held_object_have_its_depth(tmp_path):
     w[: robot.n] = q
     rows = kernels.values.tape.outputs[0]
     (values,) = hulls.row_kernels(kernels, poses).values(w, np.zeros((0, 60)))
-    distances = Hulls(problem, robot, with_object=True).measure(q, poses)[0]
+    distances = CoalHulls(problem, robot, with_object=True).measure(q, poses)
     limited = np.minimum(0.1 * values[rows:].T, hulls.min_distances + MEASURED_RANGE_M)
     np.testing.assert_allclose(limited, distances, atol=1e-4)
 
@@ -331,7 +328,7 @@ def test_collisions_between_grid_points_require_more_clearance(tmp_path):
     )  # deeper than fed back
     q = np.linspace(*BESIDE_WALL, 400).T.copy()
     missing = tool.hulls.missing(q, np.zeros(400), poses)
-    distances = tool.hulls.measure(q, poses)[0]
+    distances = tool.hulls.measure(q, poses)
     np.testing.assert_allclose(
         missing, np.maximum(tool.hulls.min_distances - distances, 0), atol=1e-12
     )
@@ -349,9 +346,7 @@ def test_a_collision_of_the_verdict_becomes_larger_distances_around_its_phase(tm
     assert not extra[:2].any()
     assert not extra[6:].any()
     assert extra[3:5].max() > 0.003
-    collides = (
-        tool.hulls.min_distances - tool.hulls.measure(path[[7]].T, poses)[0][0] > 0
-    )
+    collides = tool.hulls.min_distances - tool.hulls.measure(path[[7]].T, poses)[0] > 0
     assert (extra[3][collides] > 0.003).all()
 
 
@@ -460,7 +455,7 @@ def test_a_slot_that_is_too_narrow_for_capsules_is_wide_enough_for_hulls(
     tool = Refiner(problem, robot)
     assert tool.measures_hulls == compiled
     hulls, checker, start = (
-        Hulls(problem, robot),
+        compiled_hulls(problem, robot),
         PlanChecker(problem, robot, degree=tool.spec.degree),
         tool.line_guess(task),
     )
@@ -489,7 +484,7 @@ def test_a_contact_of_an_end_does_not_prolong_the_search(tmp_path, monkeypatch):
     task = between(problem, np.add(IN_SLOT, farther))
     tool = Refiner(problem, robot)
     ends = np.stack([task.boundary.start_q[0], task.boundary.goal_q[0]], axis=1)
-    start, goal = tool.hulls.measure(ends, task.scene.poses[0])[0].min(axis=1)
+    start, goal = tool.hulls.measure(ends, task.scene.poses[0]).min(axis=1)
     assert goal - start > 1e-4
     constraints = (
         replace(each, distance=start + CONTACT_M)

@@ -1,7 +1,6 @@
 """Joint-space paths around obstacles: free of collisions by meshes, reproducible, and needed by some tasks."""
 
 from collections.abc import Callable
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -17,7 +16,6 @@ from cnpgen.refine.rrt_connect import (
     find_paths,
     follow_line,
 )
-from cnpgen.refine.solver.hulls import Hulls
 from cnpgen.refine.strategy import PlanChecker, refine_task
 from cnpgen.refine.task import Outcome
 from cnpgen.trajectory.boundary import assemble
@@ -35,10 +33,7 @@ def wall(tmp_path_factory: pytest.TempPathFactory) -> Problem:
 
 
 def space_of(problem: Problem) -> RestSpace:
-    return replace(
-        refiner(problem).rest_space(between(problem, BESIDE_WALL)),
-        hulls=Hulls(problem, load_robot(problem)),
-    )
+    return refiner(problem).rest_space(between(problem, BESIDE_WALL))
 
 
 def until(collides: Callable[[np.ndarray], np.ndarray]) -> Follow:

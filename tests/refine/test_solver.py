@@ -21,16 +21,19 @@ from cnpgen.refine.refine_engine import prepare, tasks_of
 from cnpgen.refine.refine_plans import refine_plans, solve_plans
 from cnpgen.refine.refinement import Refinement
 from cnpgen.refine.refiner import Refiner
-from cnpgen.refine.solver import compiled_backend, qp_subproblem, sqp
+from cnpgen.refine.solver import compiled_backend, sqp
 from cnpgen.refine.solver.bounds import (
     INTERVAL_FRACTION,
     NO_TIGHTENING,
     Bounds,
     bounds_template,
 )
-from cnpgen.refine.solver.compiled_backend import CompiledBackend
+from cnpgen.refine.solver.compiled_backend import (
+    CompiledBackend,
+    load_step_library,
+)
 from cnpgen.refine.solver.grid import make_grid
-from cnpgen.refine.solver.qp_subproblem import NumpyBackend, ResidualSelection
+from cnpgen.refine.solver.qp_subproblem import ResidualSelection
 from cnpgen.refine.solver.residuals import (
     CostTerm,
     choose_cost_term,
@@ -49,7 +52,9 @@ from cnpgen.trajectory.spline_motion import Motion
 from cnpgen.trajectory.trajectory_spec import TrajectorySpec
 from cnpgen.world.world import World
 from tests.conftest import some
+from tests.examples import numpy_solver
 from tests.examples.constraints import TipSpeed
+from tests.examples.numpy_solver import NumpyBackend
 from tests.examples.plans import PROBLEMS, Plan, load, raised
 from tests.examples.refiner import (
     cost_term_of,
@@ -83,7 +88,8 @@ def transcription(
     )
     counts = () if cost_term is None else residual_counts(plan.robot, cost_term)
     stages = (kernels.load(builder) for builder in (stage_values, stage_jacobian))
-    stage = ResidualKernels(spec, *stages, cost_term, residuals, counts)
+    step = load_step_library(kernels)
+    stage = ResidualKernels(spec, *stages, step, cost_term, residuals, counts)
     return Transcription(
         stage,
         make_grid(spec, points),
@@ -604,7 +610,7 @@ def test_the_solution_of_a_subproblem_meets_the_optimality_conditions(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     for module in (
-        qp_subproblem,
+        numpy_solver,
         compiled_backend,
     ):  # a violation by 1e-6 of a row's length is too large here
         monkeypatch.setattr(module, "QP_TOLERANCE", 1e-9)

@@ -502,6 +502,43 @@ def test_links_of_an_srdf_that_the_urdf_lacks_are_a_warning(tmp_path, caplog):
         with_ignored_pairs(text, [("hand", "foot")])
 
 
+@pytest.mark.parametrize(
+    ("content", "text"),
+    [
+        (
+            '<disable_colisions link1="hand" link2="base"/>',
+            r"<disable_colisions> in <robot> \(did you mean 'disable_collisions'",
+        ),
+        (
+            '<disable_collisions link1="hand" link="base"/>',
+            "the attribute 'link' of <disable_collisions>",
+        ),
+        ('<disable_default_collisions link="hand"/>', "is not supported: its"),
+    ],
+)
+def test_elements_of_an_srdf_that_are_not_honoured_are_refused(tmp_path, content, text):
+    srdf = tmp_path / "crane.srdf"
+    srdf.write_text(f"<robot>{content}</robot>")
+    with pytest.raises(RecipeError, match=text):
+        with_disabled_pairs(urdf(), srdf)
+
+
+def test_elements_of_an_srdf_that_change_nothing_are_listed(tmp_path, caplog):
+    caplog.set_level("INFO", "cnpgen")
+    pair = 'link1="hand" link2="base"'
+    plain = f"<disable_collisions {pair}/>"
+    more = f'<group name="arm"/><group_state name="home"/><rotor_params/><enable_collisions {pair}/>'
+    texts = []
+    for content in (plain, plain.replace("/>", ' reason="User"/>') + more):
+        (tmp_path / "crane.srdf").write_text(f"<robot>{content}</robot>")
+        texts.append(
+            disabled_pairs(with_disabled_pairs(urdf(), tmp_path / "crane.srdf"))
+        )
+    assert texts[0] == texts[1]
+    listed = "not used: <enable_collisions>, <group>, <group_state>, <rotor_params>"
+    assert listed in caplog.text
+
+
 def test_a_robot_without_collision_geometry_has_no_shape(tmp_path):
     file = write_crane(tmp_path, {link: [] for link in LINKS})
     with pytest.raises(

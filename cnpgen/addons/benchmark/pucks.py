@@ -106,8 +106,14 @@ def hits_from(pucks: Pucks, puck: Array, start: State) -> Plans:
         HittingVelocity(full_speed=1.0),
     )
     pipeline = Pipeline(name="pucks", problem=problem, stage=stages, path=Path("pucks"))
-    columns = dict(zip(("start_q", "start_dq", "start_ddq"), start, strict=True))
-    completed = complete(pipeline, goal_xyz=goal_xy, **columns)
+    start_q, start_dq, start_ddq = start
+    completed = complete(
+        pipeline,
+        goal_xyz=goal_xy,
+        start_q=start_q,
+        start_dq=start_dq,
+        start_ddq=start_ddq,
+    )
     if refused := sum(completed.rejections.values()):
         raise RecipeError(
             [f"pucks: {refused} of {len(completed.reasons)} cannot be hit"]

@@ -19,6 +19,7 @@ from cnpgen.addons.benchmark.run_suite import Benchmark
 from cnpgen.schema.argument_types import checked_arguments
 from cnpgen.store.files.atomic import write_file
 
+FORMULA_STARTS = ("=", "+", "-", "@", "\t", "\r")  # of cells that spreadsheets execute
 PAPER_PLANNER = "cnp-b-paper"  # the planner that the paper calls CNP-B
 # Suite -> planner -> figure -> value in the paper's text.
 PRINTED: dict[str, dict[str, dict[str, str]]] = {
@@ -255,14 +256,23 @@ def csv_text(benchmark: Benchmark) -> str:
                     row["problem"],
                     plant,
                 )
-                head = zip(_COLUMNS, (*known, row["ending"], seed), strict=True)
+                texts = (*known, row["ending"], seed)
+                head = zip(_COLUMNS, map(_inert, texts), strict=True)
                 numbers = {
                     name: int(value) if isinstance(value, bool) else value
                     for name, value in values.items()
                     if name in columns
                 }
-                writer.writerow({**dict(head), **numbers, "error": row["error"]})
+                writer.writerow(
+                    {**dict(head), **numbers, "error": _inert(row["error"])}
+                )
     return text.getvalue()
+
+
+def _inert(value: Any) -> Any:
+    """Return a cell; a text that spreadsheets would execute gets an apostrophe before it."""
+    is_formula = isinstance(value, str) and value.startswith(FORMULA_STARTS)
+    return f"'{value}" if is_formula else value
 
 
 def markdown_text(benchmark: Benchmark) -> str:

@@ -161,7 +161,7 @@ def _check_row(row: Any) -> None:
     Files are untrusted input.
     """
     check_structure(row, {"problem": WHOLE})
-    if "ending" in row:
+    if row.keys() & {"ending", "answer"}:
         check_structure(row, {**_PLANNED, "answer": Nullable({ANY_KEY: ANYTHING})})
         if (answer := row["answer"]) is not None:
             structure = (

@@ -1,8 +1,8 @@
 """Execute the plans of a file in MuJoCo.
 
-Every plan is executed separately by computed torque at 1 kHz on a robot with friction
-that its controller does not model. On a table, a plan that ends with a velocity is a
-hit: the puck lies 7 cm ahead of its end. 'cnpgen docs benchmark' describes the
+Every plan is executed separately by computed torque at 1 kHz on a robot with friction;
+its controller knows that of [drive] only. On a table, a plan that ends with a velocity
+is a hit: the puck lies 7 cm ahead of its end. 'cnpgen docs benchmark' describes the
 simulation and its results. The exit code is 0 if every plan succeeds (it scores without
 touching the puck early, or reaches its goal without collision), and 1 otherwise.
 """

@@ -20,7 +20,7 @@ from cnpgen.planner.time_parametrization import (
 from cnpgen.planner.time_scaling import MAX_TIME_SCALE, TIME_SCALE_MARGIN
 from cnpgen.trajectory.spline import basis, graded_edges, taylor_coefficients
 
-BLOCK = 16  # outputs of a layer that are accumulated together
+BLOCK = 32  # outputs of a layer that are accumulated together
 INPUTS = 4  # of a layer that pass at once
 GAUSS_NODES = (
     4  # half of those of ``Motion.duration``: errors of 1e-9 in the same cells

@@ -14,7 +14,7 @@ from cnpgen.cli.parser import Options, refuse
 from cnpgen.errors import UsageError
 
 FORMAT = "c"
-_OF_PLANS = ("rate", "plan", "sample", "join", "at")
+_OF_PLANS = ("rate", "plan", "sample", "join", "at", "scenes")
 
 
 def add_options(options: Options) -> None:
@@ -50,7 +50,7 @@ def run(arguments: argparse.Namespace) -> int:
             f"a model is exported with --to {FORMAT}, got {arguments.to!r} (other formats are of plans)"
         )
     for name in _OF_PLANS:
-        if getattr(arguments, name) is not None:
+        if getattr(arguments, name, None) is not None:
             raise UsageError(f"--{name} is for plans, and {arguments.file} is a model")
     folder: Path = arguments.out or Path(f"{arguments.file.stem}-{FORMAT}")
     if folder.exists() and not folder.is_dir():

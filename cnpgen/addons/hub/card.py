@@ -16,6 +16,7 @@ from cnpgen.addons.hub.card_problem import (
 from cnpgen.addons.hub.markdown import markdown_table
 from cnpgen.problems.constraints.joint import judged_torque
 from cnpgen.problems.problem_record import as_record, open_problem
+from cnpgen.robots.drive import RIGID
 from cnpgen.store.dataset_spec import DatasetSpec
 from cnpgen.store.dataset_summary import DatasetSummary
 from cnpgen.store.field import Field
@@ -205,7 +206,7 @@ def _making(summary: DatasetSummary, created: str) -> str:
         "random numbers": spec.generator,
         "kernels": spec.backend,
         "stored as": spec.dtype,
-        "torque limits": _torque(spec),
+        "torque": _torque(spec),
         "specification": f"fingerprint `{spec.fingerprint}`",
         "made with": ", ".join(
             f"{name} {version}" for name, version in spec.versions.items()
@@ -219,11 +220,13 @@ def _making(summary: DatasetSummary, created: str) -> str:
 
 
 def _torque(spec: DatasetSpec) -> str:
-    """Return which torque the problem limits if it states drives; empty for the rigid body."""
-    if "drive" not in problem_of(spec):
-        return ""
-    problem, robot = open_problem(as_record(spec.problem))
-    return judged_torque(problem.constraint, robot)
+    """Return which torque the problem limits, as 'cnpgen show' does; empty if it limits none."""
+    stated = problem_of(spec)
+    if "drive" in stated:
+        problem, robot = open_problem(as_record(spec.problem))
+        return judged_torque(problem.constraint, robot)
+    kinds = {each.get("use") for each in stated.get("constraint", ())}
+    return RIGID if "joint-torque" in kinds else ""
 
 
 def _field_table(fields: Sequence[Field]) -> str:

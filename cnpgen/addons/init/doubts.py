@@ -8,8 +8,8 @@ from xml.etree.ElementTree import Element
 
 import numpy as np
 
-from cnpgen.addons.init.urdf_elements import unread_elements
 from cnpgen.robots.urdf import number_in, numbers_in
+from cnpgen.robots.urdf_elements import unread_elements
 
 MAX_SPEED_RAD_S = 50.0  # of a revolute joint; faster ones are probably in deg/s
 MAX_ANGLE_RAD = 2 * math.pi + 1e-6  # of a roll, pitch or yaw
@@ -36,9 +36,16 @@ def doubts(tree: Element) -> Iterator[str]:
 
 
 def _of_joint(joint: Element) -> Iterator[str]:
-    speed = number_in(joint.find("limit"), "velocity", 0.0)
-    if joint.get("type") in {"revolute", "continuous"} and speed > MAX_SPEED_RAD_S:
-        text = f"joint {joint.get('name', '')}: its velocity limit is {speed:g} rad/s"
+    name, kind, limit = joint.get("name", ""), joint.get("type"), joint.find("limit")
+    if kind in {"revolute", "continuous", "prismatic"} and joint.find("axis") is None:
+        yield f"joint {name}: it has no <axis>, so that it moves along or about 1 0 0"
+    if kind in {"revolute", "prismatic"} and limit is not None:
+        missing = [key for key in ("lower", "upper") if key not in limit.attrib]
+        if len(missing) == 1:
+            yield f"joint {name}: its <limit> has no {missing[0]!r}, which means 0"
+    speed = number_in(limit, "velocity", 0.0)
+    if kind in {"revolute", "continuous"} and speed > MAX_SPEED_RAD_S:
+        text = f"joint {name}: its velocity limit is {speed:g} rad/s"
         yield f"{text}; {speed:g} deg/s would be {math.radians(speed):.4g} rad/s: is it in degrees?"
 
 

@@ -27,6 +27,7 @@ class StatedJointLimits:
 
     path: Path
     values: Mapping[str, Mapping[str, float]]
+    unused: tuple[str, ...] = ()  # sentences about elements of the file
 
     def of(self, key: str) -> dict[str, float]:
         """Return the values of a key: joint -> limit."""
@@ -59,7 +60,15 @@ def read_joint_limits(path: Path, joints: tuple[str, ...]) -> StatedJointLimits:
                 f"{path}: the URDF has no joint {name!r}{nearest(name, joints)}"
             )
         values[name] = _limits(f"{path}: {name}", table)
-    return StatedJointLimits(path, values)
+    unused = [
+        f"{path.name}: {name}: {key} is not used, since {flag} is not true"
+        for name, table in content["joint_limits"].items()
+        for flag, keys in _LIMITS.items()
+        for key in keys
+        if key in table and key not in values[name]
+    ]
+    factors = [f"{path.name}: {key} is not used" for key in _DEFAULTS if key in content]
+    return StatedJointLimits(path, values, (*unused, *factors))
 
 
 def _limits(place: str, table: Any) -> dict[str, float]:
@@ -118,4 +127,5 @@ def with_joint_limits(arm: Arm, limits: StatedJointLimits) -> Arm:
             replaced=tuple(sorted(stated)),
         )
 
-    return replace(arm, planned=tuple(map(changed, arm.planned)))
+    planned = tuple(map(changed, arm.planned))
+    return replace(arm, planned=planned, doubts=(*arm.doubts, *limits.unused))

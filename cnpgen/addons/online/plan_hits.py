@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 from weakref import WeakKeyDictionary
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from cnpgen.addons.online.hit_tasks import (
     State,
@@ -18,14 +20,16 @@ from cnpgen.addons.online.hit_tasks import (
 from cnpgen.addons.online.moving_pucks import MovingHits, PuckModel, plan_moving_hits
 from cnpgen.arrays import Array
 from cnpgen.errors import UsageError, counted
+from cnpgen.judges.plans.judge import Judge
 from cnpgen.machine.threads import one_thread
 from cnpgen.pipelines.completion import Completion
 from cnpgen.planner.planner import Planner, plan_tasks
 from cnpgen.plans.boundary_problems import CONTEXT
 from cnpgen.plans.join import JoinedPlans, join_plans
 from cnpgen.plans.plans import Plans
+from cnpgen.plans.tips import correct_tips
 from cnpgen.problems.constraints.puck_contact import PuckContact
-from cnpgen.problems.problem_record import as_problem
+from cnpgen.problems.problem_record import as_problem, as_record, open_problem
 from cnpgen.schema.argument_types import check_fields, checked_arguments
 from cnpgen.schema.arguments import concerning, number, numbers
 from cnpgen.schema.old_keywords import CALLER, with_old_keywords
@@ -34,7 +38,8 @@ from cnpgen.schema.old_keywords import CALLER, with_old_keywords
 
 CONTACT_DISTANCE_M = 0.07
 
-RETURNING_SPEED_SHARE = 0.98  # of hits with a way back, by default
+# Of hits with a way back, by default: the next one if the hit or the way back is invalid.
+RETURNING_SPEED_SHARES = (0.98, 0.95, 0.9, 0.8)
 
 _COMPLETIONS: WeakKeyDictionary[Planner, Completion] = WeakKeyDictionary()
 
@@ -94,7 +99,8 @@ class HitOptions:
             [m]; by default that of the problem's constraint ``puck-contact``, or 0.07
             without one.
         speed_share: Speed of the hit as a fraction of the highest possible one, a
-            number or shape (N,); by default 1, or 0.98 with ``home``: at the highest
+            number or shape (N,); by default 1. With ``home`` it is the first of 0.98,
+            0.95, 0.9 and 0.8 with which hit and way back are valid: at the highest
             speed, joints reach their velocity limits, which the way back then exceeds.
         puck_model: Drag, restitution and friction of a moving puck; by default those of
             the simulator.
@@ -157,8 +163,8 @@ def plan_hits(
         old_keywords: Fields of the options, as keywords of version 1.0.
 
     Returns:
-        Plans of the hits that have an answer, not checked yet, and the reasons why the
-        others have none.
+        Plans of the hits that have an answer, and the reasons why the others have none.
+        They are checked only with ``home`` and the default speed.
 
     Raises:
         UsageError: A shape is wrong, a value is not finite, the contact distance
@@ -168,9 +174,6 @@ def plan_hits(
     chosen = with_old_keywords(
         "plan_hits", options, HitOptions(), old_keywords, caller=CALLER + 1
     )
-    speed_share = chosen.speed_share
-    if speed_share is None:
-        speed_share = 1.0 if home is None else RETURNING_SPEED_SHARE
     completion = _COMPLETIONS.get(planner)
     if completion is None:
         completion = _COMPLETIONS[planner] = load_completion(
@@ -182,36 +185,98 @@ def plan_hits(
         0.0 if contact is None else contact.overlap,
     )
     if puck_velocity is None and meeting_time is None:
-        tasks = hit_tasks(
-            completion,
-            state,
-            puck,
-            target,
-            contact_distance=distance,
-            share=speed_share,
+        plan = partial(
+            _plan_resting,
+            planner,
+            (completion, state, puck, target),
+            lengths=(distance, overlap),
             parameters=parameters,
         )
-        columns = {name: tasks[name][0] for name in CONTEXT}
-        boundary = boundary_of_tasks(tasks, planner.model.fixed_at_goal)
-        plans = plan_tasks(planner, boundary, tasks.alive, columns)
-        hits = PlannedHits(plans, tasks.why(), np.zeros(len(plans)), overlap)
     else:
         if parameters is not None:
             raise UsageError("must be None for moving pucks", argument="parameters")
         velocity = np.zeros(2) if puck_velocity is None else puck_velocity
-        arguments = state, puck, velocity, target, speed_share, meeting_time
-        model = chosen.puck_model or PuckModel()
-        moving = MovingHits(
-            planner.robot.n, arguments, model=model, distance=distance, overlap=overlap
+        plan = partial(
+            _plan_moving,
+            planner,
+            (completion, state, puck, velocity, target, meeting_time),
+            lengths=(distance, overlap),
+            model=chosen.puck_model or PuckModel(),
         )
-        hits = PlannedHits(*plan_moving_hits(planner, completion, moving), overlap)
-    return (
-        hits
-        if home is None
-        else replace(
-            hits, return_plans=_plan_returns(planner, hits, numbers("home", home))
-        )
+    if home is None:
+        return plan(1.0 if chosen.speed_share is None else chosen.speed_share)
+
+    def with_return(speed_share: ArrayLike) -> PlannedHits:
+        hits = plan(speed_share)
+        back = _plan_returns(planner, hits, numbers("home", home))
+        return replace(hits, return_plans=back)
+
+    if chosen.speed_share is None:
+        return _first_valid(planner, with_return)
+    return with_return(chosen.speed_share)
+
+
+def _plan_resting(
+    planner: Planner,
+    task: tuple[Completion, State, ArrayLike, ArrayLike],
+    speed_share: ArrayLike,
+    *,
+    lengths: tuple[float, float],
+    parameters: ArrayLike | None,
+) -> PlannedHits:
+    """Plan hits of pucks at rest; the lengths are the contact distance and the overlap [m]."""
+    distance, overlap = lengths
+    tasks = hit_tasks(
+        *task, contact_distance=distance, share=speed_share, parameters=parameters
     )
+    columns = {name: tasks[name][0] for name in CONTEXT}
+    boundary = boundary_of_tasks(tasks, planner.model.fixed_at_goal)
+    plans = plan_tasks(planner, boundary, tasks.alive, columns)
+    return PlannedHits(plans, tasks.why(), np.zeros(len(plans)), overlap)
+
+
+def _plan_moving(
+    planner: Planner,
+    task: tuple[Completion, State, ArrayLike, ArrayLike, ArrayLike, ArrayLike | None],
+    speed_share: ArrayLike,
+    *,
+    lengths: tuple[float, float],
+    model: PuckModel,
+) -> PlannedHits:
+    """Plan hits of moving pucks; the lengths are the contact distance and the overlap [m]."""
+    completion, *positions, meeting_time = task
+    distance, overlap = lengths
+    arguments = *positions, speed_share, meeting_time
+    moving = MovingHits(
+        planner.robot.n, arguments, model=model, distance=distance, overlap=overlap
+    )
+    return PlannedHits(*plan_moving_hits(planner, completion, moving), overlap)
+
+
+def _first_valid(
+    planner: Planner, plan: Callable[[ArrayLike], PlannedHits]
+) -> PlannedHits:
+    """Plan hits with ways back at the first speed of each at which both motions are valid."""
+    first, *slower = RETURNING_SPEED_SHARES
+    hits, judge = plan(first), Judge(*open_problem(as_record(planner.model.problem)))
+    shares = np.full(len(hits.reasons), first)
+    for share in slower:
+        invalid = ~(_valid(judge, hits.plans) & _valid(judge, hits.return_plans))
+        if not invalid.any():
+            break
+        shares[hits.plans.sample_id[invalid]] = share
+        hits = plan(shares)
+    return hits
+
+
+def _valid(judge: Judge, plans: Plans | None) -> NDArray[np.bool_]:
+    """Return which plans are valid by the independent verdict, shape (M,)."""
+    if plans is None or not len(plans):
+        return np.zeros(0, bool)
+    plans = correct_tips(plans)
+    conditions = plans.boundary, plans.scene, plans.columns["goal_xyz"]
+    verdicts = judge(plans.motion, *conditions, early_exit=True)
+    return np.array([verdict.valid for verdict in verdicts])
 
 
 def _plan_returns(planner: Planner, hits: PlannedHits, home: Array) -> Plans:

@@ -102,6 +102,7 @@ class LinkOrientation(_LinkPoseConstraint):
         unit="rad",
         low=1e-9,
         default=TOLERANCE,
+        plausible=1.0,
     )
 
     @cached_property
@@ -207,6 +208,7 @@ class LinkPosition(_LinkPoseConstraint):
         unit="m",
         low=1e-9,
         default=TOLERANCE,
+        plausible=0.5,
     )
 
     def __post_init__(self) -> None:

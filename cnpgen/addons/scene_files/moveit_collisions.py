@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator
+from collections.abc import Collection, Iterator, Mapping
+from dataclasses import dataclass
 from typing import Any
 
 from cnpgen.problems.scenes.scene_problem import SceneError
 from cnpgen.problems.scenes.yaml_document import part, scalar
 from cnpgen.store.files.accounted import AccountedMapping, mark_read
 
+MAX_SCALE, MAX_PADDING_M = 10.0, 1.0
 ACM, OCTOMAP = "allowed_collision_matrix", "<octomap>"
 
 
@@ -22,42 +24,71 @@ def is_true(value: Any, where: str) -> bool:
     raise SceneError(f"{where} must be true or false, got {value!r:.60}")
 
 
+@dataclass(frozen=True)
+class AllowedCollisions:
+    """Collisions that a scene allows.
+
+    Attributes:
+        touching: Object -> links and attached objects that may touch it.
+        ignored: Objects of the world that anything may touch.
+    """
+
+    touching: Mapping[str, tuple[str, ...]]
+    ignored: frozenset[str]
+
+
 def read_allowed_collisions(
     scene: AccountedMapping,
     objects: Collection[str],
     attached: Collection[str],
     place: str,
-) -> dict[str, tuple[str, ...]]:
-    """Return attached object -> links that may touch it.
+) -> AllowedCollisions:
+    """Return the allowed collisions of the objects of the world, and of attached ones.
 
     Pairs of two objects of the world never move against each other, and those of links
-    are the pairs of the robot's problem. Other pairs with an object are refused.
+    are the pairs of the robot's problem. An entry takes precedence over the default of
+    a name, and a default of true is refused where they differ.
     """
     matrix = part(scene, ACM, dict, place)
-    defaults = [str(name) for name in part(matrix, "default_entry_names", list, place)]
-    values = part(matrix, "default_entry_values", list, place)
-    if len(values) != len(defaults):
-        raise SceneError(f"{place}: {ACM} needs one entry for each name")
-    world, touching = {*objects, OCTOMAP}, dict[str, tuple[str, ...]]()
-    refused = [
-        f"{name} and all others"
-        for name, value in zip(defaults, values, strict=True)
-        if is_true(value, f"{place}: {ACM}")
-    ]
-    for pair in _allowed_pairs(matrix, place):
-        bodies, links = pair & {*attached}, pair - world - {*attached}
-        if len(bodies) == 1 and len(links) == 1:
-            (body,) = bodies
-            touching[body] = (*touching.get(body, ()), *links)
-        elif (pair & world and not pair <= world) or len(bodies) == 2:
-            refused.append(" and ".join(sorted(pair)))
+    always, never = _defaults(matrix, place)
+    pairs, world = {*_allowed_pairs(matrix, place)}, [*objects, OCTOMAP]
+    names = {str(name) for name in part(matrix, "entry_names", list, place)}
+    refused = [f"{name} and all others" for name in always if name in attached]
+    for name in always:
+        entries = names - {name} if name in names else set[str]()
+        others = sorted(other for other in entries if {name, other} not in pairs)
+        refused += [f"true for {name} and false for it and {other}" for other in others]
+        refused += [f"true for {name} and false for {other}" for other in never]
+        pairs |= {frozenset((name, each)) for each in (*world, *attached)}
+    touching = dict[str, list[str]]()
+    for pair in sorted(pairs, key=sorted):
+        # The object of the world comes first, then the one that is attached.
+        rank = {name: (name not in world, name not in attached, name) for name in pair}
+        body, *others = sorted(pair, key=rank.__getitem__)
+        if not pair.isdisjoint((*world, *attached)) and not pair.issubset(world):
+            touching.setdefault(body, []).extend(others)
     if matrix:
         scene.account.unused.append(ACM)
     if refused:
-        text = "expected pairs of links, of an attached object and a link, or of two objects"
+        text = "expected pairs, or names without a default of false that all may touch"
         scene.account.refuse(ACM, refused[0], text)
     mark_read(matrix)
-    return touching
+    ignored = frozenset(world) & frozenset(always)
+    found = {body: tuple(links) for body, links in touching.items()}
+    return AllowedCollisions(found, ignored)
+
+
+def _defaults(matrix: Any, place: str) -> tuple[list[str], list[str]]:
+    """Return the names whose pairs without an entry are allowed, and those whose pairs are checked."""
+    names = [str(name) for name in part(matrix, "default_entry_names", list, place)]
+    values = part(matrix, "default_entry_values", list, place)
+    if len(values) != len(names):
+        raise SceneError(f"{place}: {ACM} needs one entry for each name")
+    flags = [is_true(value, f"{place}: {ACM}") for value in values]
+    pairs = [*zip(names, flags, strict=True)]
+    return [name for name, flag in pairs if flag], [
+        name for name, flag in pairs if not flag
+    ]
 
 
 def _allowed_pairs(matrix: Any, place: str) -> Iterator[frozenset[str]]:
@@ -78,19 +109,24 @@ def _allowed_pairs(matrix: Any, place: str) -> Iterator[frozenset[str]]:
                 yield frozenset({first, second})
 
 
-def check_padding(scene: AccountedMapping, place: str) -> None:
-    """Refuse links with a padding other than 0 or a scale other than 1."""
-    for key, entry_key, neutral in (
-        ("link_padding", "padding", 0.0),
-        ("link_scale", "scale", 1.0),
+def read_link_sizes(
+    scene: AccountedMapping, place: str
+) -> tuple[tuple[str, float, float], ...]:
+    """Return links with their scale and padding [m], other than 1 and 0."""
+    sizes, neutral = dict[str, list[float]](), (1.0, 0.0)
+    for column, (key, name, most) in enumerate(
+        (("link_scale", "scale", MAX_SCALE), ("link_padding", "padding", MAX_PADDING_M))
     ):
+        links = set[str]()
         for entry in part(scene, key, list, place):
             link = part(entry, "link_name", str, place)
-            value = scalar(entry.get(entry_key), f"{place}: {key} of {link!r}")
-            if value != neutral:
-                entry.account.refuse(
-                    key,
-                    value,
-                    f"expected {neutral:g} for the link {link!r}: links keep their"
-                    " sizes, enlarge the objects instead",
-                )
+            value = scalar(entry.get(name), f"{place}: {key} of {link!r}")
+            if link in links:
+                raise SceneError(f"{place}: {key} has the link {link!r} twice")
+            links.add(link)
+            if not neutral[column] <= value <= most:
+                bounds = f"{neutral[column]:g} to {most:g} for the link {link!r}"
+                entry.account.refuse(key, value, f"expected {bounds}, as links grow")
+            elif value != neutral[column]:
+                sizes.setdefault(link, [*neutral])[column] = value
+    return tuple((link, scale, padding) for link, (scale, padding) in sizes.items())

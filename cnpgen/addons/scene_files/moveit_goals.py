@@ -96,6 +96,7 @@ def _joint_goal(goal: Any, joints: tuple[str, ...], start: Array, where: str) ->
             raise SceneError(f"{where}: a goal constrains the joint {name!r} twice")
         constrained.add(name)
         place = f"{where}: goal of joint {name!r}"
+        check_weight(constraint, place)
         values[0, joints.index(name)] = scalar(constraint.get("position"), place)
         for row, key in enumerate(("tolerance_below", "tolerance_above"), 1):
             tolerance = scalar(constraint.get(key) or 0, f"{place}: {key}")
@@ -105,6 +106,15 @@ def _joint_goal(goal: Any, joints: tuple[str, ...], start: Array, where: str) ->
                 )
             values[row, joints.index(name)] = tolerance
     return values
+
+
+def check_weight(constraint: Any, where: str) -> None:
+    """Raise SceneError for a weight that is no finite number from 0 on; its value has no effect."""
+    weight = constraint.get("weight")
+    if weight is not None and not 0 <= scalar(weight, f"{where}: weight") < np.inf:
+        raise SceneError(
+            f"{where}: weight must be finite and not negative, got {weight!r:.60}"
+        )
 
 
 def read_goal_pose(
@@ -121,6 +131,7 @@ def read_goal_pose(
             f" {len(positions)} and {len(orientations)}"
         )
     position, link = positions[0], part(positions[0], "link_name", str, where)
+    check_weight(position, where)
     center, radius = _region(position, where)
     frame, turn, tolerance = frame_id(position, where), np.eye(3), np.full(3, np.pi)
     if orientations:
@@ -177,6 +188,7 @@ def _region(constraint: Any, where: str) -> tuple[Array, float]:
 
 def orientation_of(constraint: Any, where: str) -> tuple[Array, Array, str]:
     """Return rotation matrix, tolerances up to pi [rad] and parametrization of an orientation constraint."""
+    check_weight(constraint, where)
     tolerance = np.array(
         [
             scalar(

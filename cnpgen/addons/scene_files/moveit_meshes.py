@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import logging
+from collections.abc import Mapping, Sequence
 from pathlib import Path, PurePosixPath
 from typing import Any
 
@@ -14,6 +15,24 @@ from cnpgen.problems.scenes.yaml_document import vector
 from cnpgen.robots.shape.inline import corners_of, inline_mesh
 
 PACKAGE = "package://"
+
+_LOG = logging.getLogger(__name__)
+
+
+def warn_of_unneeded_packages(
+    documents: Mapping[Path, Any], packages: Sequence[Path]
+) -> None:
+    """Warn of folders of packages if no document names a mesh file."""
+    if packages and not any(map(_names_a_file, documents.values())):
+        _LOG.warning("no scene names a mesh file: the packages are not needed")
+
+
+def _names_a_file(document: Any) -> bool:
+    if isinstance(document, list):
+        return any(map(_names_a_file, document))
+    if not isinstance(document, dict):
+        return False
+    return "resource" in document or any(map(_names_a_file, document.values()))
 
 
 def with_mesh_files(document: Any, scene: Path, packages: Sequence[Path]) -> Any:

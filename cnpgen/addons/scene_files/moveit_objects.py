@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Any
@@ -26,6 +27,7 @@ from cnpgen.problems.scenes.scene_problem import SceneError, check_count
 from cnpgen.problems.scenes.scene_request import AttachedObject
 from cnpgen.problems.scenes.yaml_document import part, scalar
 
+_LOG = logging.getLogger(__name__)
 OPERATIONS = ("ADD", "REMOVE", "APPEND", "MOVE")  # in the order of their codes
 
 
@@ -212,6 +214,8 @@ def read_attached(
             raise SceneError(
                 f"{place} has no header.frame_id, expected {link!r} or another frame"
             )
+        elif known is not None:
+            _LOG.warning("%s takes the place of the object in the world", place)
         weight = entry.get("weight")
         mass = 0.0 if weight is None else scalar(weight, f"{place}: weight")
         if not 0 <= mass < np.inf:

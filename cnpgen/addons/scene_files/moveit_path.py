@@ -15,7 +15,7 @@ from cnpgen.addons.scene_files.link_constraints import (
     LinkPosition,
 )
 from cnpgen.addons.scene_files.moveit_frames import FrameTable, frame_id, pose_of
-from cnpgen.addons.scene_files.moveit_goals import orientation_of
+from cnpgen.addons.scene_files.moveit_goals import check_weight, orientation_of
 from cnpgen.addons.scene_files.moveit_shapes import primitive_kind, primitive_sizes
 from cnpgen.problems.constraints.constraint import LinkConstraint
 from cnpgen.problems.scenes.placement import moved_obstacle
@@ -60,6 +60,7 @@ def read_path_constraints(
         )
     for entry in part(constraints, "position_constraints", list, where):
         frame, link = _frame_and_link(entry, where)
+        check_weight(entry, where)
         frame, pose = table.resolve(frame, (np.zeros(3), np.eye(3)))
         regions = _regions(part(entry, "constraint_region", dict, where), where)
         placed = tuple(moved_obstacle(each, pose) for each in regions)

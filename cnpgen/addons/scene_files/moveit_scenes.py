@@ -17,9 +17,10 @@ from typing import Any
 import numpy as np
 
 from cnpgen.addons.scene_files.moveit_collisions import (
-    check_padding,
+    OCTOMAP,
     is_true,
     read_allowed_collisions,
+    read_link_sizes,
 )
 from cnpgen.addons.scene_files.moveit_frames import (
     FrameTable,
@@ -31,7 +32,10 @@ from cnpgen.addons.scene_files.moveit_goals import (
     read_joint_goals,
     read_start,
 )
-from cnpgen.addons.scene_files.moveit_meshes import with_mesh_files
+from cnpgen.addons.scene_files.moveit_meshes import (
+    warn_of_unneeded_packages,
+    with_mesh_files,
+)
 from cnpgen.addons.scene_files.moveit_objects import (
     add_object_frames,
     placed_attached,
@@ -43,6 +47,7 @@ from cnpgen.addons.scene_files.moveit_path import read_path_constraints
 from cnpgen.addons.scene_files.moveit_shapes import built
 from cnpgen.addons.scene_files.moveit_unused import UNUSED_ELEMENTS
 from cnpgen.addons.scene_files.octomap import read_octomap
+from cnpgen.errors import listed, nearest
 from cnpgen.problems.scenes.scene_problem import (
     MAX_SCENE_OBSTACLES,
     SceneError,
@@ -53,6 +58,7 @@ from cnpgen.problems.scenes.scene_request import SceneRequest
 from cnpgen.problems.scenes.yaml_document import part, scalar
 from cnpgen.robots.obstacle import Obstacle
 from cnpgen.store.files.accounted import (
+    MISSPELT,
     Account,
     AccountedMapping,
     accounted,
@@ -78,40 +84,63 @@ def read_moveit(
     folder whose name differs by "request" and "scene" only: ``request0001.yaml`` and
     ``scene0001.yaml``. A scene without a request is an error.
     """
+    warn_of_unneeded_packages(documents, options.packages)
     for path, document in documents.items():
         is_scene = "collision_objects" in document or "world" in document
         if "goal_constraints" not in document:
-            if is_scene and _partner(path, "scene", "request") not in documents:
-                raise SceneError(
-                    f"{path}: the scene has no request with goal_constraints in this file or beside it"
-                )
-            continue
+            if is_scene and _partner(path, "scene", "request") in documents:
+                continue
+            what = "scene" if is_scene else "start_state"
+            raise SceneError(
+                f"{path}: the {what} has no request with goal_constraints in this file or beside it"
+                f"{_hint(document, 'goal_constraints')}"
+            )
         scene_path = path if is_scene else _partner(path, "request", "scene")
         if scene_path not in documents:
             raise SceneError(
                 f"{path}: there is no scene {scene_path.name} beside the request"
+                f"{_hint(document, 'world', 'collision_objects')}"
             )
+        yield _read_pair(scene_path, path, documents, options)
+
+
+def _hint(document: Mapping[str, Any], *missing: str) -> str:
+    """Return the keys of a document that are probably a missing one, misspelt."""
+    hints = (nearest(key, missing, similarity=MISSPELT) for key in document)
+    found = [f"{key}{hint}" for key, hint in zip(document, hints, strict=True) if hint]
+    return f"; unknown: {listed(found)}" if found else ""
+
+
+def _read_pair(
+    scene_path: Path, path: Path, documents: dict[Path, Any], options: ReadingOptions
+) -> tuple[SceneProblem, Account]:
+    """Return the problem of a scene and a request, which may be one document, with its account."""
+    parts = []
+    for file in dict.fromkeys((scene_path, path)):
         account = Account(
-            f"{scene_path}",
+            f"{file}",
             UNUSED_ELEMENTS,
             allow_unused=options.allow_unused,
             error=SceneError,
         )
-        scene, own = (
-            accounted(with_mesh_files(documents[file], file, options.packages), account)
-            for file in (scene_path, path)
-        )
-        own = scene if scene_path == path else own
-        try:
-            problem = _problem(scene_path, scene, path, own, options.present)
-        except SceneError as error:
-            if not (unknown := misspelt(scene, own)):
-                raise
-            text = f"{error.args[0]}; {unknown}"
-            raise SceneError(text, remedies=error.remedies) from error
-        account.finish(scene, *([] if own is scene else [own]))
-        request = replace(problem.request, accepted=tuple(account.accepted))
-        yield replace(problem, request=request), account
+        content = with_mesh_files(documents[file], file, options.packages)
+        parts.append(accounted(content, account))
+    scene, own = parts[0], parts[-1]
+    try:
+        problem = _problem(scene_path, scene, path, own, options.present)
+    except SceneError as error:
+        if not (unknown := misspelt(*parts)):
+            raise
+        text = f"{error.args[0]}; {unknown}"
+        raise SceneError(text, remedies=error.remedies) from error
+    for each in parts:
+        each.account.finish(each)
+    account = scene.account
+    if own is not scene:
+        account.unused += own.account.unused
+        account.accepted += own.account.accepted
+    request = replace(problem.request, accepted=tuple(account.accepted))
+    return replace(problem, request=request), account
 
 
 def _partner(path: Path, old: str, new: str) -> Path:
@@ -145,11 +174,15 @@ def _problem(
     carried = [each for one in own for each in read_attached(one, objects, where)]
     add_object_frames(table, {item.name: item for item, _ in carried})
     names = [each.name for _, each in carried]
-    touching = read_allowed_collisions(scene, objects, names, place)
-    check_padding(scene, place)
-    obstacles = list(_obstacles(scene, objects, table, place))
+    allowed = read_allowed_collisions(scene, objects, names, place)
+    obstacles = [
+        each
+        for each in _obstacles(scene, objects, table, place)
+        if each[0] not in allowed.ignored
+    ]
+    touching = tuple(allowed.touching.get(body, ()) for body, *_ in obstacles)
     attached = tuple(
-        placed_attached(item, with_touch_links(each, touching), table, place)
+        placed_attached(item, with_touch_links(each, allowed.touching), table, place)
         for item, each in carried
     )
     problem = _with_goals(request, where, joints, start, table)
@@ -158,7 +191,7 @@ def _problem(
     return replace(
         problem,
         name=name,
-        obstacles=tuple(obstacle for _, obstacle in obstacles),
+        obstacles=tuple(obstacle for *_, obstacle in obstacles),
         source=str(scene_path),
         request=replace(
             problem.request,
@@ -166,9 +199,11 @@ def _problem(
             start_dq=velocity,
             velocity_scale=velocity_scale,
             acceleration_scale=acceleration_scale,
-            obstacle_frames=tuple(frame for frame, _ in obstacles),
+            obstacle_frames=tuple(frame for _, frame, _ in obstacles),
+            obstacle_touch_links=touching if any(touching) else (),
             fixed_frames=tuple(table.used.items()),
             attached=attached,
+            link_sizes=read_link_sizes(scene, place),
             constraints=tuple(each for _, each in constraints),
             constraint_frames=tuple(frame for frame, _ in constraints),
         ),
@@ -299,13 +334,14 @@ def _obstacles(
     objects: dict[str, Any],
     table: FrameTable,
     place: str,
-) -> Iterator[tuple[str, Obstacle]]:
-    """Yield the frames and the obstacles of the world."""
+) -> Iterator[tuple[str, str, Obstacle]]:
+    """Yield the names in the allowed collisions, the frames and the obstacles of the world."""
     count = 0
     for item in objects.values():
         frame, pose = table.resolve(item.frame, item.pose)
         for obstacle in built(item.name, item.shapes, pose, place):
             count += 1
-            yield frame, obstacle
+            yield item.name, frame, obstacle
     world = part(scene, "world", dict, place)
-    yield from read_octomap(world, table, MAX_SCENE_OBSTACLES - count, place)
+    for frame, box in read_octomap(world, table, MAX_SCENE_OBSTACLES - count, place):
+        yield OCTOMAP, frame, box

@@ -10,8 +10,6 @@ HARMLESS = {
     "joint_state.header": "joint positions have no frame",
     "multi_dof_joint_state.joint_names": "name of the joint that places the base",
     ".robot_state.multi_dof_joint_state.header": "it has no transforms",
-    "link_padding.link_name": "every padding is 0",
-    "link_scale.link_name": "every scale is 1",
     "path_constraints.name": "name of constraints",
     "octomap.octomap.header": "the frame is that of the message around it",
     "collision_objects.type": "key of a database of objects",

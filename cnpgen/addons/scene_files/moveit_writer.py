@@ -105,6 +105,7 @@ def check_plain(scene: SceneProblem) -> None:
     if (
         request.changes_problem
         or any(request.obstacle_frames)
+        or any(request.obstacle_touch_links)
         or request.goal_frame
         or scene.other_goal_poses
         or request.start_dq is not NO_REQUEST.start_dq

@@ -80,6 +80,9 @@ def _problem(path: Path, name: str, entry: Any, place: str) -> SceneProblem:
     pose = _goal_pose(part(entry, "goal_pose", dict, place), place)
     if not goals and pose is None:
         raise SceneError(f"{place} has neither goal_ik nor goal_pose")
+    if goals and pose is not None:
+        # Plans end at a goal state.
+        entry.account.unused.append("goal_pose")
     frame = part(entry, "world_frame", str, place)
     frame = "" if frame in BASE_FRAMES else frame
     obstacles = tuple(_obstacles(part(entry, "obstacles", dict, place), place))

@@ -8,6 +8,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from cnpgen.addons.scene_files.moveit_meshes import warn_of_unneeded_packages
 from cnpgen.addons.scene_files.moveit_scenes import is_moveit, read_moveit
 from cnpgen.addons.scene_files.moveit_writer import check_plain, moveit_texts
 from cnpgen.addons.scene_files.mpinets_scenes import (
@@ -80,20 +81,27 @@ def load_scenes(
     """
     path, start = Path(path), integer("start", start, least=0)
     stop = None if n is None else start + integer("n", n, least=1)
-    if not all(isinstance(each, str | Path) for each in packages):
+    is_list = not isinstance(packages, str | Path)
+    if not is_list or not all(isinstance(each, str | Path) for each in packages):
         raise UsageError(
-            f"must be paths of folders, got {packages}", argument="packages"
+            f"must be paths of folders, got {packages!r}", argument="packages"
+        )
+    if missing := [each for each in packages if not Path(each).is_dir()]:
+        raise UsageError(
+            f"must be folders, there is no {missing[0]}", argument="packages"
         )
     options = ReadingOptions(
         tuple(allow_unused), tuple(map(Path, packages)), present or {}
     )
     files, allowed = _files(path), options.allow_unused
     if len(files) == 1 and _is_hdf5(files[0]):
+        warn_of_unneeded_packages({}, options.packages)
         found = list(read_mpinets(files[0], slice(start, stop), allow_unused=allowed))
     else:
         last = stop if stop is not None else start + MAX_SCENES + 1
         found = list(itertools.islice(_scenes(files, options), start, last))
     scenes = [scene for scene, _ in found]
+    _warn_of_unneeded_start(scenes, options.present)
     if len(scenes) > MAX_SCENES:
         raise SceneError(
             f"{path} has more than {MAX_SCENES:,} scenes: choose some by start and n"
@@ -102,6 +110,20 @@ def load_scenes(
         raise UsageError(f"{path} has no scene from number {start} on", concerns="path")
     _report(path, [account for _, account in found])
     return [checked_scene(scene) for scene in scenes]
+
+
+def _warn_of_unneeded_start(
+    scenes: Sequence[SceneProblem], present: Mapping[str, float]
+) -> None:
+    """Warn of a present state at which no scene starts."""
+    names, positions = tuple(present), [*present.values()]
+    if present and not any(
+        scene.joint_names == names and scene.start_q.tolist() == positions
+        for scene in scenes
+    ):
+        _LOG.warning(
+            "the present state of the robot (start) is not used: no start_state of the scenes is empty"
+        )
 
 
 def _report(path: Path, accounts: Sequence[Account]) -> None:
@@ -177,13 +199,15 @@ def _scenes(
             read_yaml(file) if len(files) > 1 else _with_partner(file, moveit)
         ):
             if is_moveit(document):
-                moveit[file] = {**moveit.get(file, {}), **document}
+                _add(moveit, file, document)
             elif is_robometrics(document):
                 yield from read_robometrics(file, document, allow_unused=allowed)
             elif len(files) == 1:
                 raise SceneError(
                     f"{file} is neither a planning scene or request of MoveIt nor a robometrics file"
                 )
+            else:
+                _LOG.warning("%s has no scene and is not used", file)
     yield from read_moveit(moveit, options)
 
 
@@ -193,11 +217,20 @@ def _with_partner(file: Path, moveit: dict[Path, Any]) -> list[Any]:
         head, word, tail = file.name.rpartition(old)
         partner = file.with_name(head + new + tail)
         if word and partner.is_file():
-            documents = [
-                document for document in read_yaml(partner) if is_moveit(document)
-            ]
-            moveit |= {partner: documents[0]} if documents else {}
+            for document in read_yaml(partner):
+                if is_moveit(document):
+                    _add(moveit, partner, document)
     return read_yaml(file)
+
+
+def _add(moveit: dict[Path, Any], file: Path, document: dict[str, Any]) -> None:
+    """Add a document of a file, which may have a scene and a request in two of them."""
+    known = moveit.setdefault(file, {})
+    if twice := sorted(known.keys() & document.keys()):
+        raise SceneError(
+            f"{file} has several documents with {listed(twice)}: expected one scene and one request"
+        )
+    known |= document
 
 
 @checked_arguments

@@ -10,11 +10,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from cnpgen.addons.trajectories.trajectory_tables import (
-    LEROBOT_INFO,
-    read_parquet,
-    read_trajectory_tables,
-)
+from cnpgen.addons.trajectories.lerobot_tables import LEROBOT_INFO
+from cnpgen.addons.trajectories.parquet_tables import read_parquet
+from cnpgen.addons.trajectories.trajectory_tables import read_trajectory_tables
 from cnpgen.arrays import Array
 from cnpgen.errors import DatasetError, UsageError, listed
 from cnpgen.store.files.atomic import read_file

@@ -125,7 +125,9 @@ def _draw_trajectory(
     chosen = first if index is None else index
     trajectory, verdict = found.trajectories[chosen], found.verdicts[chosen]
     margins = [
-        entry.margin for entry in verdict.conditions.values() if not entry.margin.ok
+        entry.margin
+        for entry in verdict.conditions.values()
+        if entry.is_measured and not entry.margin.ok
     ]
     problem, robot = open_problem(found.problem)
     title = f"{problem.name}, {labels[chosen]}: {trajectory.duration:.3f} s\n{verdict}"

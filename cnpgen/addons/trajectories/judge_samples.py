@@ -28,6 +28,7 @@ from cnpgen.addons.trajectories.interpolate import (
     through_positions,
 )
 from cnpgen.addons.trajectories.judge_family import FamilyJudge
+from cnpgen.addons.trajectories.limited_witness import limited_witness
 from cnpgen.addons.trajectories.refuted_limits import (
     BOTH,
     VELOCITIES,
@@ -57,6 +58,7 @@ MAX_LINEAR_SPAN_S = 0.0101
 SMOOTH_NEIGHBORS = 8  # positions that determine velocities between two of them
 # Of the tolerance of accelerations and jerks that the smooth curve uses.
 TOLERANCE_SHARE = 0.9
+WITNESS_SHARES = 0.98, 0.9  # that a curve with limited accelerations uses
 LINES = "the positions are connected by lines"
 NO_JITTER_BOUND = "a jitter of the times needs limits of velocities and accelerations"
 RESOLUTION = "errors between the samples are as estimated from their resolution"
@@ -104,7 +106,8 @@ def judge_samples(
     moved = with_jitter(errors, limits, trajectory)
     exact = is_negligible(moved, trajectory, ends.acceleration)
     detail = ""
-    for curve, step in _curves(trajectory, errors, ends, exact=exact):
+    tries = _curves(trajectory, errors, limits, ends, exact=exact)
+    for curve, step in tries:
         excess = _joint_limit_excess(curve, limits)
         if excess is None:
             verdict = judge(curve, trajectory, scene=scene, step=step)
@@ -153,7 +156,9 @@ def with_jitter(
     return replace(errors, q=float(q), dq=float(dq), ddq=float(ddq))
 
 
-def acceleration_limits(limits: ProvenJointLimits) -> AccelerationLimits:
+def acceleration_limits(
+    limits: ProvenJointLimits, tolerance_share: float = TOLERANCE_SHARE
+) -> AccelerationLimits:
     """Return the smallest acceleration and jerk limits of a problem with most of their tolerances."""
     n = len(limits.joints)
     smallest = {"ddq": np.full(n, np.inf), "jerk": np.full(n, np.inf)}
@@ -162,7 +167,7 @@ def acceleration_limits(limits: ProvenJointLimits) -> AccelerationLimits:
     ):
         quantity = quantity_of(constraint)
         if quantity in smallest:
-            allowed = np.minimum(-bounds[:n], bounds[n:]) + TOLERANCE_SHARE * tolerance
+            allowed = np.minimum(-bounds[:n], bounds[n:]) + tolerance_share * tolerance
             smallest[quantity] = np.minimum(
                 smallest[quantity], np.maximum(allowed, 0.0)
             )
@@ -177,18 +182,24 @@ def _is_dense(trajectory: Trajectory) -> bool:
 def _curves(
     trajectory: Trajectory,
     errors: SampleErrors,
-    limits: AccelerationLimits,
+    limits: ProvenJointLimits,
+    ends: AccelerationLimits,
     *,
     exact: bool,
 ) -> Iterator[tuple[CurveFamily, float | None]]:
     """Yield curves within the errors of all samples, with the step at which they are judged."""
-    if exact and is_resolved(trajectory, limits.acceleration):
+    if exact and is_resolved(trajectory, ends.acceleration):
         if trajectory.ddq is not None:
             yield family_of_data(trajectory.t, data_of(trajectory)), None
-        if (curve := smooth_curve(trajectory, limits)) is not None:
+        if (curve := smooth_curve(trajectory, ends)) is not None:
             yield curve, None
-    if (curve := witness(trajectory, errors)) is not None:
-        yield curve, MAX_STEP_S
+    if (curve := witness(trajectory, errors)) is None:
+        return
+    yield curve, MAX_STEP_S
+    for share in WITNESS_SHARES:
+        limit = acceleration_limits(limits, share).acceleration
+        if (curve := limited_witness(trajectory, errors, limit)) is not None:
+            yield curve, MAX_STEP_S
 
 
 def _joint_limit_excess(curve: CurveFamily, limits: ProvenJointLimits) -> str | None:

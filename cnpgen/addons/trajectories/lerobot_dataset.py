@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from cnpgen.addons.trajectories.trajectory_tables import (
+from cnpgen.addons.trajectories.lerobot_tables import (
     LEROBOT_ENVIRONMENT,
     LEROBOT_INFO,
 )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal
 
@@ -26,6 +27,10 @@ class LoadOptions:
             the end of the range of angles.
         drop_repeats: Whether to drop rows that repeat the time and the positions of the
             row before.
+        topic: Topic of a bag of ROS, if several have trajectories.
+        extrapolate: Whether parameters may be outside of their ranges. The problem then
+            has wider ranges, and a name that ends with "-extrapolated".
+        allow_unused: Keys of messages and scenes that are accepted without effect.
 
     Raises:
         UsageError: A value has another type, or the rate is not above 0.
@@ -38,8 +43,14 @@ class LoadOptions:
     separate_by: str | None = None
     unwrap: bool = False
     drop_repeats: bool = False
+    topic: str | None = None
+    extrapolate: bool = False
+    allow_unused: Sequence[str] = ()
 
     def __post_init__(self) -> None:
         check_fields(self)
         if self.rate is not None and not number("rate", self.rate) > 0:
             raise UsageError(f"must be above 0, got {self.rate}", argument="rate")
+
+
+DEFAULT_OPTIONS = LoadOptions()

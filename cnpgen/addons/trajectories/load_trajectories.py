@@ -22,7 +22,11 @@ from cnpgen.addons.trajectories.trajectory_tables import read_trajectory_tables
 from cnpgen.arrays import Array
 from cnpgen.errors import UsageError, either, nearest
 from cnpgen.problems.problem import Problem
-from cnpgen.problems.problem_record import ProblemRecord, open_problem
+from cnpgen.problems.problem_record import (
+    ProblemRecord,
+    extrapolated_record,
+    open_problem,
+)
 from cnpgen.problems.scenes.scene_problem import SceneProblem
 from cnpgen.robots.parameter_ranges import PARAMETER_UNITS
 from cnpgen.robots.plausible_values import UnitError, find_implausible_value
@@ -67,7 +71,8 @@ def load_trajectories(
     """Load sampled trajectories from a file or a folder; 'cnpgen docs trajectories' lists formats and columns.
 
     Args:
-        path: CSV, JSON, YAML, NPZ, HDF5 or Parquet file, or a folder of them.
+        path: CSV, JSON, YAML, NPZ, HDF5 or Parquet file, bag of ROS, or a folder of
+            files.
         problem: Problem, record, or name or path of a problem, pipeline or dataset.
         joints: Names of the problem's joints in the file, in the problem's order; by
             default the same names. For arrays without names: indices.
@@ -104,13 +109,14 @@ def load_trajectories(
         rate=chosen.rate,
         unwrap=chosen.unwrap,
         drop_repeats=chosen.drop_repeats,
+        extrapolate=chosen.extrapolate,
         separated=chosen.separate_by is not None,
         parameters=parameters or {},
     )
     try:
         tables = [
             part
-            for table in read_trajectory_tables(Path(path), separator=chosen.separator)
+            for table in read_trajectory_tables(Path(path), chosen)
             for part in _separated(table, chosen.separate_by)
         ]
         readers = [
@@ -128,8 +134,14 @@ def load_trajectories(
     for reader, trajectory in zip(readers, trajectories, strict=True):
         reader.check_units(trajectory)
     ignored = dict.fromkeys(name for reader in readers for name in reader.unused())
+    if chosen.extrapolate:
+        values = [each.parameters for each in trajectories]
+        stated = [row for row in values if row is not None]
+        record = extrapolated_record(record, np.array(stated)) if stated else record
     if scenes is not None:
-        record, trajectories = with_scenes(record, trajectories, scenes)
+        record, trajectories = with_scenes(
+            record, trajectories, scenes, allow_unused=chosen.allow_unused
+        )
     return LoadedTrajectories(
         record,
         trajectories,

@@ -1,9 +1,13 @@
-"""Documents of JSON and YAML as tables: messages of ROS and MoveIt, lists of rows, and objects of columns."""
+"""Documents of JSON and YAML as tables: messages of ROS and MoveIt, lists of rows, and objects of columns.
+
+Every element of a message is read, refused by name, or in the tables of unused elements.
+"""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
 from fractions import Fraction
 from typing import Any
 
@@ -12,6 +16,12 @@ from numpy.typing import NDArray
 
 from cnpgen.addons.trajectories.trajectory_table import TrajectoryTable
 from cnpgen.errors import UsageError
+from cnpgen.store.files.accounted import (
+    Account,
+    UnusedElements,
+    accounted,
+    mark_read,
+)
 
 Values = NDArray[Any]
 
@@ -30,22 +40,79 @@ _NESTING = (
     "result",
     "response",
 )
-_OTHER_POINTS = "multi_dof_joint_trajectory"  # motions of a base
+# Motions of a base, of RobotTrajectory and of FollowJointTrajectory.
+_OTHER_POINTS = "multi_dof_joint_trajectory", "multi_dof_trajectory"
+_STARTS = "trajectory_start", "start_state"  # moveit_msgs/RobotState
 _SUCCESS = 1  # moveit_msgs/MoveItErrorCodes
+UNUSED_ELEMENTS = UnusedElements(
+    {
+        "header": "time of publishing; the points have times of their own",
+        "header.seq": "number of the message",
+        "header.frame_id": "positions of joints have no frame",
+        "effort": "torques follow from the motion",
+        "error_code.message": "text",
+        "error_code.source": "text",
+        "group_name": "name",
+        "model_id": "name",
+        "planner_id": "name",
+        "pipeline_id": "name",
+        "planning_time": "of the planner",
+        "processing_time": "of the planner",
+        "goal_id": "number of the goal",
+        "status": "error_code is read",
+        "trajectory_start.joint_state": "the points have positions",
+        "start_state.joint_state": "the points have positions",
+        "trajectory_start.is_diff": "of the state of the planner",
+        "start_state.is_diff": "of the state of the planner",
+    },
+    {
+        "path_tolerance": "of a controller",
+        "goal_tolerance": "of a controller",
+        "component_path_tolerance": "of a controller",
+        "component_goal_tolerance": "of a controller",
+        "goal_time_tolerance": "of a controller",
+        "executed_trajectory": "the planned one is read",
+    },
+)
 
 
-def tables_of_document(document: Any, place: str) -> Iterator[TrajectoryTable]:
-    """Yield the trajectories of a message, of a list of messages or rows, or of an object of columns."""
+def tables_of_document(
+    document: Any, place: str, allow_unused: Sequence[str] = ()
+) -> list[TrajectoryTable]:
+    """Return the trajectories of a message, of a list of messages or rows, or of an object of columns.
+
+    Raises:
+        UsageError: The document is none of them, or has an element that is not used
+            and not in ``allow_unused``.
+    """
+    account = Account(place, UNUSED_ELEMENTS, allow_unused=allow_unused)
+    root = accounted({"": document}, account)
+    tables = list(_tables(root[""], place))
+    account.finish(root)
+    unused = *dict.fromkeys(account.unused), *account.accepted
+    return [replace(table, unused=unused) for table in tables]
+
+
+def states_table(
+    messages: Sequence[Any], place: str, allow_unused: Sequence[str] = ()
+) -> TrajectoryTable:
+    """Return one trajectory of a stream of ``sensor_msgs/JointState``; errors as of ``tables_of_document``."""
+    (table,) = tables_of_document(list(messages), place, allow_unused)
+    return table
+
+
+def _tables(document: Any, place: str) -> Iterator[TrajectoryTable]:
+    """Yield the trajectories of a part of a document."""
     if (
         isinstance(document, list)
         and document
         and all(isinstance(entry, dict) for entry in document)
     ):
         if is_joint_state(document[0]):
-            yield table_of_states(document, place)
+            yield _table_of_states(document, place)
         elif any(key in document[0] for key in ("points", *_NESTING)):
             for index, entry in enumerate(document):
-                yield from tables_of_document(entry, f"{place}: [{index}]")
+                yield from _tables(entry, f"{place}: [{index}]")
         else:
             yield TrajectoryTable(place, _from_rows(document, place))
     elif isinstance(document, dict) and "points" in document:
@@ -54,33 +121,51 @@ def tables_of_document(document: Any, place: str) -> Iterator[TrajectoryTable]:
         key := next((key for key in _NESTING if document.get(key)), None)
     ):
         _check_message(document, place)
-        yield from tables_of_document(document[key], f"{place}: {key}")
+        yield from _tables(document[key], f"{place}: {key}")
     elif isinstance(document, dict) and any(
         isinstance(values, list) for values in document.values()
     ):
-        names = document.get("joint_names", [])
-        columns = {
-            str(key): _array(values, f"{place}: {key}")
-            for key, values in document.items()
-            if isinstance(values, list) and values and key != "joint_names"
-        }
-        yield TrajectoryTable(
-            place, columns, tuple(map(str, names)) if isinstance(names, list) else ()
-        )
+        yield _table_of_columns(document, place)
     else:
         expected = "a JointTrajectory or RobotTrajectory message, a list of rows, or an object of columns"
-        raise UsageError(f"{place}: expected {expected}, got {type(document).__name__}")
+        raise UsageError(f"{place}: expected {expected}, got {_kind(document)}")
+
+
+def _table_of_columns(document: Mapping[str, Any], place: str) -> TrajectoryTable:
+    """Return the table of an object of columns; single values are columns, too."""
+    columns = {}
+    for key, values in document.items():
+        if isinstance(values, Mapping):
+            raise UsageError(f"{place}: {key} is an object, expected a list")
+        if key != "joint_names" and values is not None and values != []:
+            columns[str(key)] = _array(values, f"{place}: {key}")
+    names = document.get("joint_names")
+    if names is not None:
+        names = _names(names, f"{place}: joint_names")
+    return TrajectoryTable(place, columns, tuple(names or ()))
 
 
 def _check_message(message: Mapping[str, Any], place: str) -> None:
-    """Refuse motions of a base, and responses of requests that failed."""
-    other = message.get(_OTHER_POINTS)
-    if isinstance(other, dict) and other.get("points"):
-        raise UsageError(
-            f"{place}: {_OTHER_POINTS} has points: the base of the robot must not move"
-        )
-    code = message.get("error_code")
-    value = code.get("val", _SUCCESS) if isinstance(code, dict) else _SUCCESS
+    """Refuse motions of a base, attached objects, and responses of requests that failed."""
+    for name in _OTHER_POINTS:
+        other = message.get(name)
+        if isinstance(other, dict) and other.get("points"):
+            raise UsageError(
+                f"{place}: {name} has points: the base of the robot must not move"
+            )
+        mark_read(other)
+    for name in _STARTS:
+        state = message.get(name)
+        if isinstance(state, dict):
+            if state.get("attached_collision_objects"):
+                raise UsageError(
+                    f"{place}: {name} has attached objects: {{scenes}} gives a scene with them",
+                    remedies={"scenes": None},
+                )
+            # Poses of virtual joints.
+            mark_read(state.get("multi_dof_joint_state"))
+    code = message.get("error_code", {"val": _SUCCESS})
+    value = code.get("val") if isinstance(code, dict) else code
     if value != _SUCCESS:
         raise UsageError(
             f"{place}: error_code is {value!r:.20}, expected {_SUCCESS}: the request failed"
@@ -92,7 +177,7 @@ def is_joint_state(document: Any) -> bool:
     return isinstance(document, dict) and {"name", "position"} <= document.keys()
 
 
-def table_of_states(messages: Sequence[Any], place: str) -> TrajectoryTable:
+def _table_of_states(messages: Sequence[Any], place: str) -> TrajectoryTable:
     """Return one trajectory of a stream of ``sensor_msgs/JointState``.
 
     Joints are found by their names in every message. Times are those of the stamps,
@@ -125,6 +210,8 @@ def table_of_states(messages: Sequence[Any], place: str) -> TrajectoryTable:
                 )
             columns[column].append(_array(values, f"{where}.{key}")[rows])
     t = np.array([float(stamp - stamps[0]) for stamp in stamps])
+    if len(t) > 1 and not t.any():
+        raise UsageError(f"{place}: all stamps are equal: the messages have no times")
     found = {MESSAGE_TIME: t} | {
         name: np.stack(rows) for name, rows in columns.items() if rows
     }
@@ -145,14 +232,16 @@ def _from_rows(rows: Sequence[Mapping[str, Any]], place: str) -> dict[str, Value
     }
 
 
-def _array(values: list[Any], place: str) -> Values:
-    """Return a list as an array of numbers or texts."""
+def _array(values: Any, place: str) -> Values:
+    """Return a list, or a single value, as an array of numbers or texts."""
+    for entry in values if type(values) is list else [values]:
+        mark_read(entry)
     try:
         found = np.array(values)
     except ValueError as error:
         raise UsageError(f"{place}: its rows have different lengths") from error
     if found.dtype.kind not in "biufU":
-        raise UsageError(f"{place}: expected numbers, got {values[0]!r:.60}")
+        raise UsageError(f"{place}: expected numbers, got {values!r:.60}")
     return found
 
 
@@ -182,11 +271,21 @@ def _from_message(message: Mapping[str, Any], place: str) -> TrajectoryTable:
                 )
             if len(columns.setdefault(name, [])) != index:
                 raise UsageError(f"{where}.{key}: earlier points have none")
+            mark_read(values)
             columns[name].append(values)
     return TrajectoryTable(
         place,
         {name: _array(rows, f"{place}: {name}") for name, rows in columns.items()},
         tuple(names),
+    )
+
+
+def _kind(document: Any) -> str:
+    """Return the kind of a document of another content."""
+    kinds = (dict, "an object of other keys"), (list, "a list of others")
+    return next(
+        (text for kind, text in kinds if isinstance(document, kind)),
+        f"{document!r:.60}",
     )
 
 

@@ -14,6 +14,7 @@ KIND_NAMES = {
     "dq": ("dq", "qd", "velocity", "velocities", "vel"),
     "ddq": ("ddq", "qdd", "acceleration", "accelerations", "acc"),
 }
+KIND_WORDS = {"q": "position", "dq": "velocity", "ddq": "acceleration"}
 _INDEX = re.compile(r"\[(\d+)\]$")  # "position[0]" is "position_0"
 _SEPARATORS = (" ", "_", ".", "/", ":", "")
 
@@ -44,7 +45,7 @@ def joint_columns(
         return [name for name in named if name]
     if any(named):
         missing = joints[named.index(None)]
-        raise ValueError(f"no column with the {KIND_NAMES[kind][1]} of {missing!r}")
+        raise ValueError(f"no column with the {KIND_WORDS[kind]} of {missing!r}")
     if any(joint.isdecimal() for joint in joints):
         return None
     numbered = [

@@ -23,16 +23,19 @@ from cnpgen.addons.trajectories.table_units import (
     plain,
     stated_factor,
 )
-from cnpgen.addons.trajectories.trajectory_table import TrajectoryTable
+from cnpgen.addons.trajectories.trajectory_table import (
+    MAX_RATE_DEVIATION,
+    TrajectoryTable,
+)
 from cnpgen.arrays import Array
 from cnpgen.errors import UsageError, listed, nearest
 from cnpgen.plans.format import PHASE_COLUMN
 from cnpgen.problems.problem_record import ProblemRecord
 from cnpgen.store.scene_table import OBSTACLE_POSES
 
-MAX_RATE_DEVIATION = 0.01  # of a stated rate from that of the file's times, relative
 UNUSED_KINDS = ("jerk", "effort", "efforts")  # not reported as ignored
 MAX_EXACT_START_S = 1e6  # later times of the first sample lose digits in float64
+MAX_HELD_DIFFERENCE = 1e-9  # rad or m, of joints that are not planned
 MAX_LISTED = 12  # columns in messages
 
 
@@ -47,6 +50,7 @@ class ReadOptions:
     rate: float | None = None
     unwrap: bool = False
     drop_repeats: bool = False
+    extrapolate: bool = False
     separated: bool = False  # into parts of a file
     parameters: Mapping[str, float] = field(default_factory=dict)
 
@@ -55,7 +59,8 @@ class ReadOptions:
 class TableReader:
     """Reader of one trajectory of a table.
 
-    ``used`` has the names of the columns that were read, ``notes`` sentences about how.
+    ``used`` has the names of the columns that were read, ``notes`` sentences about how,
+    ``other_joints`` the joints of arrays that the problem does not plan.
     """
 
     table: TrajectoryTable
@@ -64,6 +69,7 @@ class TableReader:
     velocity_limit: Array
     used: set[str] = field(default_factory=set)
     notes: list[str] = field(default_factory=list)
+    other_joints: list[str] = field(default_factory=list)
 
     def trajectory(self) -> Trajectory:
         """Return the trajectory; its parameters are None if some are missing."""
@@ -106,7 +112,7 @@ class TableReader:
         """Return the trajectory of rows with parameters and scene, after a check of its units."""
         parameters, poses = self._parameters(), self._obstacle_poses()
         try:
-            if parameters is not None:
+            if parameters is not None and not self.options.extrapolate:
                 self.record.parameters.checked(parameters)
             trajectory = Trajectory(**rows, parameters=parameters, obstacle_poses=poses)
         except UsageError as error:
@@ -151,9 +157,10 @@ class TableReader:
     def unused(self) -> list[str]:
         """Return the names of the columns that were not read, except those of known other kinds."""
         names = [name for name in self.table.columns if name not in self.used]
-        return [
+        names = [
             name for name in names if not plain(name).lower().startswith(UNUSED_KINDS)
         ]
+        return [*names, *dict.fromkeys(self.other_joints), *self.table.unused]
 
     def _error(self, text: str, **details: Any) -> UsageError:
         return UsageError(f"{self.table.place}: {text}", **details)
@@ -169,6 +176,16 @@ class TableReader:
             raise self._error(f"the joint {twice[0]!r} is there more than once")
         if not self.table.has_head:
             self._check_numbered()
+        self._check_held_joints()
+
+    def _check_held_joints(self) -> None:
+        """Check that joints that are not planned are where the problem holds them."""
+        held = self.record.held_joints
+        for joint, position in self.table.held_joints.items():
+            if joint in held and abs(position - held[joint]) > MAX_HELD_DIFFERENCE:
+                raise self._error(
+                    f"the joint {joint!r} is held at {position:g}, the problem holds it at {held[joint]:g}"
+                )
 
     def _check_numbered(self) -> None:
         """Check that columns without names are those of times and joints, or named by options."""
@@ -337,8 +354,11 @@ class TableReader:
                 raise self._error(
                     f"there is no joint {missing[0]!r}, only {', '.join(named)}"
                 )
+            self.other_joints += [joint for joint in named if joint not in joints]
             return values[:, [named.index(joint) for joint in joints]]
         if all(joint.isdecimal() and int(joint) < width for joint in joints):
+            others = set(map(str, range(width))) - set(joints)
+            self.other_joints += [f"{name}[{index}]" for index in sorted(others)]
             return values[:, [int(joint) for joint in joints]]
         if width != len(joints):
             raise self._error(

@@ -31,6 +31,8 @@ TRAJECTORY_OPTIONS = (
     "drop_repeats",
     "parameters",
     "scenes",
+    "topic",
+    "allow_unused",
 )
 MAX_IGNORED = 8  # unused columns that are listed
 MAX_NOTES = 5  # that are printed
@@ -85,6 +87,10 @@ def add_trajectory_options(option: Options) -> None:
     add("--parameters", metavar="NAME=V,...", type=values.parameters, help=text)
     text = "obstacles around the trajectories: a file of scenes or of plans; one for each trajectory, or one for all"
     add("--scenes", metavar="FILE", type=recipe_names.present, help=text)
+    text = "topic of a bag of ROS, if several have trajectories"
+    add("--topic", metavar="NAME", help=text)
+    text = "element of a message or scene that may be left unused; may be repeated"
+    add("--allow-unused", metavar="KEY", action="append", help=text)
     text = "body at the tip, in place of the problem's: mass [kg], or mass and centre of mass in the tip frame [m]"
     add("--payload", metavar="M[,X,Y,Z]", type=values.payload, help=text)
 
@@ -133,6 +139,8 @@ def load_file(
 
     given = options_of(arguments, *TRAJECTORY_OPTIONS)
     given = {name: value for name, value in given.items() if value is not None}
+    if getattr(arguments, "extrapolate", False):
+        given["extrapolate"] = True
     names = given.keys() & {entry.name for entry in fields(LoadOptions)}
     reading = LoadOptions(**{name: given.pop(name) for name in names})
     loaded = load_trajectories(arguments.file, problem, options=reading, **given)
@@ -212,7 +220,7 @@ def summary_text(file: Path, found: "TrajectoryEvaluation") -> str:
         margins.append((name, *margin_cells(entry.to_dict()["margin"], worst)))
     if summary["conditions"]:
         lines += [*table(decided, indent="  ", right=(1, 2, 3, 4, 5)), ""]
-        lines += table(margins, indent="  ", right=(1, 2, 4, 5))
+        lines += table(margins, indent="  ", right=(1, 2, 3, 5, 6))
     lines += [
         "",
         *(

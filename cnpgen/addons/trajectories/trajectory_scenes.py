@@ -17,7 +17,9 @@ from cnpgen.addons.trajectories.sampled_trajectory import Trajectory
 from cnpgen.arrays import Array
 from cnpgen.errors import UsageError, counted, listed
 from cnpgen.make.recipe import load_dataset_recipe
+from cnpgen.plans.format import PlanStatus
 from cnpgen.plans.plan_file import load_plans
+from cnpgen.plans.plans import Plans
 from cnpgen.plans.scene_plans import (
     capacity_of,
     poses_of_scene,
@@ -37,7 +39,7 @@ from cnpgen.problems.problem_record import (
 from cnpgen.problems.scenes.placement import placed_scene
 from cnpgen.problems.scenes.requested_problem import requested_problem
 from cnpgen.problems.scenes.scene_problem import SceneProblem
-from cnpgen.problems.scenes.scene_reader import read_scenes
+from cnpgen.problems.scenes.scene_reader import ReadingOptions, read_scenes
 from cnpgen.robots.attached_links import attached_link_name
 from cnpgen.robots.obstacle import Obstacle
 from cnpgen.robots.scene import PARKED_POSITION_M
@@ -72,6 +74,8 @@ def with_scenes(
     record: ProblemRecord,
     trajectories: Sequence[Trajectory],
     scenes: str | Path | Sequence[SceneProblem],
+    *,
+    allow_unused: Sequence[str] = (),
 ) -> tuple[ProblemRecord, tuple[Trajectory, ...]]:
     """Place the obstacles of scenes around trajectories: one scene for each, or one for all.
 
@@ -85,23 +89,61 @@ def with_scenes(
     """
     if any(trajectory.obstacle_poses is not None for trajectory in trajectories):
         raise UsageError("the trajectories have scenes of their own", argument="scenes")
-    problem = as_problem(record)
+    placed, rows = _placed(
+        as_problem(record),
+        scenes,
+        counted(len(trajectories), "trajectory"),
+        len(trajectories),
+        allow_unused,
+    )
+    pairs = zip(trajectories, rows, strict=True)
+    return record_problem(placed), tuple(
+        replace(trajectory, obstacle_poses=row.copy()) for trajectory, row in pairs
+    )
+
+
+def plans_in_scenes(plans: Plans, scenes: str | Path) -> Plans:
+    """Place the obstacles of scenes around plans that have none: one scene for each, or one for all.
+
+    The status of the plans is unknown then. Errors are those of ``with_scenes``.
+    """
+    if OBSTACLE_POSES in plans.columns:
+        raise UsageError("the plans have scenes of their own", argument="scenes")
+    count = len(plans)
+    placed, rows = _placed(
+        as_problem(plans.problem), scenes, counted(count, "plan"), count, ()
+    )
+    return replace(
+        plans,
+        problem=record_problem(placed),
+        columns={**plans.columns, OBSTACLE_POSES: rows.copy()},
+        status=np.full(count, PlanStatus.UNKNOWN, np.uint8),
+    )
+
+
+def _placed(
+    problem: Problem,
+    scenes: str | Path | Sequence[SceneProblem],
+    motions: str,
+    count: int,
+    allow_unused: Sequence[str],
+) -> tuple[Problem, Array]:
+    """Return the problem with the obstacles of scenes, and their poses around each of some motions, (count, width)."""
     if not isinstance(scenes, str | Path):
         placed, poses = _of_problems(problem, scenes)
     elif file_kind(Path(scenes)) == PLANS:
         placed, poses = _of_plans(problem, Path(scenes))
     else:
-        placed, poses = _of_problems(problem, read_scenes(Path(scenes)))
-    if len(poses) not in {1, len(trajectories)}:
+        options = ReadingOptions(allow_unused)
+        placed, poses = _of_problems(
+            problem, read_scenes(Path(scenes), options=options)
+        )
+    if len(poses) not in {1, count}:
         raise UsageError(
-            f"must have one scene, or one for each of {counted(len(trajectories), 'trajectory')}, got {len(poses)}",
+            f"must have one scene, or one for each of {motions}, got {len(poses)}",
             argument="scenes",
         )
-    rows = np.broadcast_to(poses, (len(trajectories), poses.shape[1]))
-    pairs = zip(trajectories, rows, strict=True)
-    return record_problem(placed), tuple(
-        replace(trajectory, obstacle_poses=row.copy()) for trajectory, row in pairs
-    )
+    return placed, np.broadcast_to(poses, (count, poses.shape[1]))
 
 
 def _of_problems(

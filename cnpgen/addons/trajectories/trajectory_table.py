@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 from numpy.typing import NDArray
 
 Values = NDArray[Any]
+
+# Of a stated rate from that of the file's times, relative.
+MAX_RATE_DEVIATION = 0.01
 
 
 @dataclass(frozen=True, eq=False)
@@ -24,6 +27,9 @@ class TrajectoryTable:
         lines: Numbers of the lines of a text file, for messages.
         has_head: Whether the file names its columns, which are numbered from 0
             otherwise.
+        unused: Further elements of the file that are not read.
+        held_joints: Positions of joints that are not planned [rad or m], if the file
+            states them.
     """
 
     place: str
@@ -31,3 +37,5 @@ class TrajectoryTable:
     joint_names: tuple[str, ...] = ()
     lines: tuple[int, ...] = ()
     has_head: bool = True
+    unused: tuple[str, ...] = ()
+    held_joints: Mapping[str, float] = field(default_factory=dict)

@@ -8,7 +8,7 @@ largest weight that keeps a joint within its errors is chosen for each joint.
 """
 
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -38,10 +38,18 @@ def witness(trajectory: Trajectory, errors: SampleErrors) -> CurveFamily | None:
     # A sample taken d late differs by |dq| d; the largest allowed share is tried first.
     shares = (0.8, 0.0) if errors.t else (0.0,)
     for share in shares:
-        fit = _fitted(trajectory, errors, share)
-        if fit is not None and _is_within(fit, trajectory, errors):
+        fit = fitted(trajectory, errors, share)
+        if fit is not None and is_within(fit, trajectory, errors):
             return family_of_data(trajectory.t, fit.at(trajectory.t))
     return None
+
+
+class SplinesOfJoints(Protocol):
+    """Splines of n joints."""
+
+    def at(self, t: Array) -> list[Array]:
+        """Return positions, velocities and accelerations, shape (K, n) each."""
+        ...
 
 
 @dataclass(frozen=True, eq=False)
@@ -80,7 +88,7 @@ class _NormalEquations:
             return None
 
 
-def _fitted(
+def fitted(
     trajectory: Trajectory, errors: SampleErrors, jitter_share: float
 ) -> _Splines | None:
     """Return the splines with the largest weights whose differences are within the errors."""
@@ -176,7 +184,9 @@ def _bands(matrix: Any) -> Array:
     return bands
 
 
-def _is_within(splines: _Splines, trajectory: Trajectory, errors: SampleErrors) -> bool:
+def is_within(
+    splines: "SplinesOfJoints", trajectory: Trajectory, errors: SampleErrors
+) -> bool:
     """Return whether splines meet every sample within its errors at one time within the jitter."""
     t, data = trajectory.t, data_of(trajectory)
     allowed = np.maximum(errors.values, MIN_ERRORS) * (1 + 1e-9)

@@ -40,7 +40,7 @@ MAX_ROWS_OF_PAGE = 50  # each adds about 0.3 MB
 def add_options(parser: Parser) -> None:
     option = parser.add_argument
     text = "a problem by name or file, the folder of a dataset, a plan file, or sampled trajectories"
-    option("what", metavar="PROBLEM|DIR|FILE", type=recipe_names.viewed, help=text)
+    option("what", metavar="PROBLEM|DIR|FILE", type=_viewed, help=text)
     rows = parser.add_mutually_exclusive_group()
     text = "plan of the file, or sample of the split (default: 0)"
     rows.add_argument("--row", metavar="I", type=values.natural, help=text)
@@ -59,6 +59,16 @@ def add_options(parser: Parser) -> None:
         "--serve", metavar="PORT", type=values.port, nargs="?", const=8000, help=text
     )
     add_trajectory_options(parser.add_argument_group("sampled trajectories"))
+
+
+def _viewed(text: str) -> str:
+    """Read the path of sampled trajectories, or any other argument of ``recipe_names.viewed``."""
+    from cnpgen.addons.trajectories.trajectory_tables import is_trajectory_file
+
+    path = Path(text)
+    if path.is_file() and is_trajectory_file(path):
+        return str(recipe_names.present(text))
+    return recipe_names.viewed(text)
 
 
 def run(arguments: argparse.Namespace) -> None:

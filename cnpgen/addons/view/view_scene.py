@@ -1,7 +1,7 @@
 """The scene of a page: the robot, and one or more views of it with obstacles, curves and the verdict."""
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -34,11 +34,11 @@ from cnpgen.problems.problem import Problem
 from cnpgen.robots.robot import Robot
 from cnpgen.robots.scene import PARKED_POSITION_M, Scene
 from cnpgen.robots.shape.hull import CUBE
-from cnpgen.robots.solid import pose_width
 from cnpgen.world.forward_kinematics import ForwardKinematics
 from cnpgen.world.path import PathWorld
 
 FRAMES_PER_MOTION = 240
+NOT_MEASURED = -np.inf  # violation of a condition that samples do not determine
 # Of obstacles without a lower end, which are drawn down to the floor.
 MIN_DRAWN_HEIGHT_M = 0.1
 DRAWN_TABLE_M = 5e-3  # thickness of a drawn table
@@ -137,7 +137,12 @@ def scene_of_trajectories(
     """Show sampled trajectories, by the interpolation that their derivatives determine."""
     views = []
     for trajectory, title, verdict in zip(trajectories, titles, verdicts, strict=True):
-        margins = {name: entry.margin for name, entry in verdict.conditions.items()}
+        margins = {
+            name: entry.margin
+            if entry.is_measured
+            else replace(entry.margin, violation=NOT_MEASURED)
+            for name, entry in verdict.conditions.items()
+        }
         extra = [margin.time for margin in margins.values() if not margin.ok]
         with np.errstate(all="ignore"):
             world, s, times, scene = along_trajectory(
@@ -244,6 +249,8 @@ def _verdict(
 
 def _margin_text(margin: Margin) -> str:
     """Return a margin as text in the units of plots."""
+    if margin.violation == NOT_MEASURED:
+        return "not measured: the samples do not determine it"
     factor, unit = plot_unit(margin.unit)
     side = "outside" if margin.violation > 0 else "inside"
     amount, tolerance = factor * abs(margin.violation), factor * margin.tolerance
@@ -383,7 +390,7 @@ def _world(problem: Problem, scene: Scene) -> Iterator[Body]:
             )
     contact, table = problem.first(PuckContact), problem.first(Table)
     if table is not None:
-        values = scene.poses[0, problem.scene_width - len(problem.parameters) :]
+        values = scene.poses[0, problem.scene_columns.parameters]
         low, high = table.bounds_of(
             dict(zip(problem.parameters.names, values.tolist(), strict=True))
         )
@@ -392,7 +399,7 @@ def _world(problem: Problem, scene: Scene) -> Iterator[Body]:
         )
         yield wrapped("table", 0, _on_table(problem, scene, corners), 0.0)
     if contact is not None:
-        x, y = scene.poses[0, pose_width(scene.obstacles) :][2:4]
+        x, y = scene.poses[0, problem.scene_columns.constraint][2:4]
         if x < PUCK_OUT_OF_REACH_M:
             corners = _disc_corners(
                 np.array([x, y, table.z if table else 0.0]),
@@ -405,7 +412,7 @@ def _world(problem: Problem, scene: Scene) -> Iterator[Body]:
 def _on_table(problem: Problem, scene: Scene, corners: Array) -> Array:
     """Return corners in the frame of the table in the world frame [m], shape (V, 3)."""
     parameters = np.repeat(
-        scene.poses[:1, problem.scene_width - len(problem.parameters) :],
+        scene.poses[:1, problem.scene_columns.parameters],
         len(corners),
         axis=0,
     )

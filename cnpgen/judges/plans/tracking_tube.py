@@ -10,9 +10,11 @@ their change.
 
 Contact of the mallet with the puck is intended at the end of a hit. The tip may be in
 the disc of permitted contact, and with an error it then touches the puck beside the
-disc. So the distance must be larger by the change d only farther than d from the disc,
-and by the distance from the disc nearer to it. Where the robot touches the puck, the
-planned tip is then within d of the disc, and the tip itself within 2 d.
+disc. So the distance must be larger by the change d only farther than 2 d from the
+disc, and nearer by the distance from the disc less d. A hit whose path is up to 60
+degrees from the normal of the contact gains the required d on the last 2 d of its way.
+Where the robot touches the puck, the planned tip is then within 2 d of the disc, and
+the tip itself within 3 d.
 """
 
 from collections.abc import Sequence
@@ -105,9 +107,9 @@ class TrackingTube:
                 distances = condition.constraint.distances_from_contact_region(
                     cast(World, self._world)
                 )
-                # Near the disc of permitted contact the required change ends at the
-                # distance from it.
-                change = np.minimum(change, distances)
+                # min(d, max(D - d, 0)) at the distance D from the disc of permitted
+                # contact.
+                change = np.minimum(change, np.maximum(distances - change, 0.0))
             return replace(condition, uncertainty=change)
 
         measured = [add(condition, context.samples.s) for condition in context.measured]

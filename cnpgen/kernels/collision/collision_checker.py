@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cnpgen.arrays import Array
+from cnpgen.errors import UsageError
 from cnpgen.kernels.collision.body_arrays import (
     BODY,
     Bodies,
@@ -36,7 +37,7 @@ _NAMES = (
     "hull_rows.c",
 )
 SOURCES = [Path(__file__).with_name(name) for name in _NAMES]
-MAX_JOINTS = 56  # of the arrays in collision.c
+MAX_JOINTS = 56  # planned ones, of the arrays in collision.c
 # Of the first call; a second one follows where it is too small.
 MIN_CONTACT_CAPACITY = 1024
 CAPSULE = np.dtype(
@@ -89,37 +90,33 @@ class _RobotScene(ctypes.Structure):
 
 def load_collision_library(
     kernels: KernelLibrary, sources: Sequence[Path] = SOURCES
-) -> ctypes.CDLL | None:
+) -> ctypes.CDLL:
     """Return the library of collision checks, the same for all robots.
 
-    None where kernels are not compiled.
+    Raises:
+        MachineError: It is missing.
     """
     library = kernels.load_source(*sources)
-    if library is not None:
-        for function in (
-            library.clear_states,
-            library.find_contacts,
-            library.joint_poses,
-        ):
-            function.restype, function.errcheck = c_long, require_memory
-        library.clear_states.argtypes = (
-            c_void_p,
-            c_void_p,
-            c_long,
-            c_double,
-            c_double,
-            c_void_p,
-        )
-        library.find_contacts.argtypes = (
-            c_void_p,
-            c_void_p,
-            c_long,
-            c_double,
-            c_int,
-            c_long,
-            *(c_void_p,) * 5,
-        )
-        library.joint_poses.argtypes = (c_void_p, c_void_p, c_long, c_void_p)
+    for function in (library.clear_states, library.find_contacts, library.joint_poses):
+        function.restype, function.errcheck = c_long, require_memory
+    library.clear_states.argtypes = (
+        c_void_p,
+        c_void_p,
+        c_long,
+        c_double,
+        c_double,
+        c_void_p,
+    )
+    library.find_contacts.argtypes = (
+        c_void_p,
+        c_void_p,
+        c_long,
+        c_double,
+        c_int,
+        c_long,
+        *(c_void_p,) * 5,
+    )
+    library.joint_poses.argtypes = (c_void_p, c_void_p, c_long, c_void_p)
     return library
 
 
@@ -128,7 +125,7 @@ class CollisionChecker:
 
     Args:
         library: Library of ``load_collision_library``.
-        robot: The robot, with at most ``MAX_JOINTS`` planned joints.
+        robot: The robot, with link geometry.
         shape: Its link geometry, by default the robot's own.
         added: Link -> distance that is added to its required ones from obstacles [m],
             by default 0; -inf for no check.
@@ -139,6 +136,9 @@ class CollisionChecker:
         link_pairs: Pairs of convex parts of links that must not touch, the one nearer
             to the base first, shape (M, 2).
         vertices: Values of the hulls of all convex parts (``HullVertices``), flat [m].
+
+    Raises:
+        UsageError: The robot has no link geometry, or too many joints.
     """
 
     def __init__(
@@ -150,7 +150,11 @@ class CollisionChecker:
         pair_added: Mapping[frozenset[str], float] | None = None,
     ) -> None:
         shape = robot.shape if shape is None else shape
-        assert shape is not None
+        if shape is None or robot.n > MAX_JOINTS:
+            text = (
+                f"distances of hulls need link geometry and at most {MAX_JOINTS} joints"
+            )
+            raise UsageError(text, concerns="problem")
         self.library, self._n, self._arrays = library, robot.n, dict[str, Any]()
         self._scene = _RobotScene()
         self._set_chain(robot)

@@ -66,7 +66,7 @@ class DistanceColumns:
 class RowKernels:
     """The kernels ``(w, poses) -> g`` and ``-> (g, dg/dw)`` of a problem, with rows of distances.
 
-    They call compiled kernels of the other rows, with derivatives column by column; w
+    They call kernels of the other rows, with derivatives column by column; w
     begins with the joint positions.
 
     Attributes:
@@ -136,9 +136,9 @@ class _RowKernel(Kernel):
         self._function.restype = None
 
     @property
-    def address(self) -> int | None:
+    def address(self) -> int:
         """Address of the machine code; see ``Kernel``."""
-        return ctypes.cast(self._function, c_void_p).value
+        return ctypes.cast(self._function, c_void_p).value or 0
 
     def __call__(self, *arguments: Array) -> list[Array]:
         """Evaluate the batch; see ``Kernel``."""

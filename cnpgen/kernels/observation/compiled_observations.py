@@ -1,7 +1,4 @@
-"""Observations of scenes in compiled code, for ``observe.c``.
-
-``ObservationBackend`` is the same in NumPy.
-"""
+"""Observations of scenes in compiled code, for ``observe.c``."""
 
 import ctypes
 from ctypes import c_int, c_long, c_void_p
@@ -12,12 +9,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cnpgen.arrays import Array
+from cnpgen.kernels.c_library import ARRAYS, load_library
 from cnpgen.kernels.compiled_kernel import address_of, require_memory
-from cnpgen.kernels.library import KernelLibrary, choose_backend
 from cnpgen.robots.observation.camera import Camera
 from cnpgen.robots.observation.observations import ObservationBackend
 from cnpgen.robots.observation.primitives import Primitives
 from cnpgen.robots.observation.surface_points import Seeds
+from cnpgen.store.files.cache_folder import default_cache_folder, usable_cache_folder
 
 Values = NDArray[np.float32]
 
@@ -145,7 +143,11 @@ def _view(camera: Camera) -> Array:
     return np.concatenate([camera.position, camera.axes.ravel()])
 
 
-def observation_backend(backend: str | None = None) -> ObservationBackend:
-    """Return the functions of a backend of kernels: compiled ones, or their NumPy reference."""
-    library = KernelLibrary(*choose_backend(backend), "").load_source(SOURCE)
-    return ObservationBackend() if library is None else CompiledObservations(library)
+def observation_backend() -> ObservationBackend:
+    """Return the functions that compute observations.
+
+    Raises:
+        MachineError: The compiled code is missing.
+    """
+    folder = usable_cache_folder(default_cache_folder())
+    return CompiledObservations(load_library((ARRAYS, SOURCE), folder))

@@ -71,11 +71,9 @@ class AtRest(Stage):
     )
 
     def describe(self) -> str:
-        kept = (
-            ", which motions must end with"
-            if self.end == "goal" and self.acceleration == "zero"
-            else ""
-        )
+        if self.end == "goal" and self.acceleration == "free":
+            return "set the velocity of the goal to zero; its acceleration is free"
+        kept = ", which motions must end with" if self.end == "goal" else ""
         return f"set velocity and acceleration of the {self.end} to zero{kept}"
 
     def outputs(self, context: Context) -> tuple[Field, ...]:

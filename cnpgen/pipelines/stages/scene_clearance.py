@@ -1,4 +1,4 @@
-"""Clearance of states in the scenes of a batch, by compiled collision checks, or by Coal without a compiler."""
+"""Clearance of states in the scenes of a batch, by compiled collision checks."""
 
 from collections.abc import Sequence
 from itertools import pairwise
@@ -13,19 +13,17 @@ from cnpgen.kernels.collision.body_arrays import (
     obstacle_bodies,
 )
 from cnpgen.kernels.collision.collision_checker import (
-    MAX_JOINTS,
     CollisionChecker,
     load_collision_library,
 )
 from cnpgen.kernels.compiled_kernel import address_of
-from cnpgen.pipelines.resting_states import RestingStates
 from cnpgen.pipelines.stages.batch_scenes import BatchScenes
 from cnpgen.pipelines.stages.stage import Context
 from cnpgen.problems.constraints.clearance import RobotClearance
 from cnpgen.problems.constraints.link_clearance import SelfClearance
 from cnpgen.problems.problem import Problem
 from cnpgen.robots.obstacle import Obstacle
-from cnpgen.robots.solid import place_obstacles, solids_of
+from cnpgen.robots.solid import place_obstacles
 
 Mask = NDArray[np.bool_]
 
@@ -98,19 +96,12 @@ class SceneClearance:
     """Clearance of states from the obstacles of their scene and of links from each other, for robots with geometry."""
 
     def __init__(self, context: Context) -> None:
-        problem, robot = context.problem, context.robot
-        self._obstacles = problem.obstacle
+        problem = context.problem
         self._obstacle_distance = _required_distance(problem, RobotClearance)
         self._self_distance = _required_distance(problem, SelfClearance)
-        library = (
-            load_collision_library(context.kernels) if robot.n <= MAX_JOINTS else None
-        )
-        self._checker: _SceneChecker | None = None
         self._prepared: BatchScenes | None = None
-        if library is None:
-            self._states = RestingStates(problem, robot)
-            return
-        self._checker = _SceneChecker(library, robot)
+        library = load_collision_library(context.kernels)
+        self._checker = _SceneChecker(library, context.robot)
         self._checker.place_fixed(problem.own_obstacles)
 
     def are_clear(
@@ -131,27 +122,12 @@ class SceneClearance:
         # Runs of states in one scene: the checker is told the obstacles once per run.
         bounds = [0, *(np.flatnonzero(np.diff(scene)) + 1).tolist(), len(scene)]
         runs = [(int(scene[first]), first, end) for first, end in pairwise(bounds)]
-        if self._checker is None:
-            return np.concatenate(
-                [
-                    self._by_coal(
-                        q[:, first:end], scenes, run, max(margin, self_margin)
-                    )
-                    for run, first, end in runs
-                ]
-            )
         # The arrays belong to a batch of scenes and are built once for it.
         if self._prepared is not scenes:
             self._checker.prepare_scenes(scenes)
             self._prepared = scenes
         limits = self._obstacle_distance + margin, self._self_distance + self_margin
         return self._checker.clear_of_scenes(q, runs, limits)
-
-    def _by_coal(
-        self, q: Array, scenes: BatchScenes, scene: int, margin: float
-    ) -> Mask:
-        self._states.place_solids(solids_of(self._obstacles, scenes.poses[scene]))
-        return self._states.are_clear(q, margin=margin)
 
 
 def _required_distance(

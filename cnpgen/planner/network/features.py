@@ -313,6 +313,6 @@ def make_scene_features(
     return SceneFeatures(
         kernels.load(link_points),
         np.array(radii),
-        observation_backend(kernels.backend),
+        observation_backend(),
         path,
     )

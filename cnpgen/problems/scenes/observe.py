@@ -29,9 +29,8 @@ def observe(
     kind: str | Observation,
     *,
     seed: int = 0,
-    backend: str | None = None,
 ) -> dict[str, NDArray[Any]]:
-    """Observe N scenes, in compiled code where there is such.
+    """Observe N scenes.
 
     Args:
         scenes: N scene problems or sequences of obstacles, one scene problem, the
@@ -40,8 +39,6 @@ def observe(
         kind: "cloud", "camera", "distances", "basis" or "tokens", or an observation
             with parameters, such as ``SurfaceCloud(points=1024)``.
         seed: Seed of the points of clouds.
-        backend: "compiled" or "numpy"; by default the fastest that works on this
-            machine.
 
     Returns:
         Name -> array with a first axis of length N; see the kinds of observations.
@@ -49,6 +46,7 @@ def observe(
     Raises:
         UsageError: There is no such observation, an obstacle is a mesh file, or there
             are no scenes.
+        MachineError: The compiled code is missing.
     """
     from cnpgen.kernels.observation.compiled_observations import observation_backend
 
@@ -58,7 +56,7 @@ def observe(
     )
     bodies = scene_bodies(scenes)
     return observation.observe(
-        bodies, scene_seeds(seed, len(bodies)), observation_backend(backend)
+        bodies, scene_seeds(seed, len(bodies)), observation_backend()
     )
 
 

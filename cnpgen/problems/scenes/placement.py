@@ -53,11 +53,17 @@ def placed_scene(scene: SceneProblem, robot: Robot, start: Array) -> SceneProble
     if not request.places:
         return scene
     frames = LinkFrames(scene, robot, start)
-    obstacles = []
-    for index, obstacle in enumerate(scene.obstacles):
-        frame = request.frame_of(index)
-        pose = frames.pose(frame, f"obstacle {obstacle.name!r}")
-        obstacles.append(moved_obstacle(obstacle, pose) if frame else obstacle)
+    obstacles, touchable = list[Obstacle](), list[AttachedObject]()
+    touching = request.obstacle_touch_links or ((),) * len(scene.obstacles)
+    for index, (each, names) in enumerate(zip(scene.obstacles, touching, strict=True)):
+        frame, what = request.frame_of(index), f"obstacle {each.name!r}"
+        pose = frames.pose(frame, what)
+        obstacle = moved_obstacle(each, pose) if frame else each
+        if links := _moving(names, request, frames, f"an allowed collision of {what}"):
+            item = AttachedObject(each.name, "", (obstacle,), ("",), links)
+            touchable.append(item)
+        else:
+            obstacles.append(obstacle)
     goal = scene.goal_pose
     if goal is not None:
         goal = _moved_goal(goal, request.goal_frame, frames)
@@ -67,15 +73,18 @@ def placed_scene(scene: SceneProblem, robot: Robot, start: Array) -> SceneProble
         _moved_goal(pose, frame, frames)
         for pose, frame in zip(poses, origins, strict=True)
     )
-    attached = tuple(_in_link(each, frames) for each in request.attached)
+    for link, *_ in request.link_sizes:
+        frames.check_link(link, "a padding or scale")
+    carried = tuple(_in_link(each, request, frames) for each in request.attached)
     constraints = tuple(_in_world(request, frames))
     plain: SceneRequest = replace(
         request,
         obstacle_frames=(),
+        obstacle_touch_links=(),
         goal_frame="",
         other_goal_frames=(),
         fixed_frames=(),
-        attached=attached,
+        attached=(*carried, *touchable),
         constraints=constraints,
         constraint_frames=(),
     )
@@ -133,12 +142,13 @@ class LinkFrames:
             f" an object or a fixed frame of the file; links: {listed(self.links, 12)}"
         )
 
+    def moves(self, link: str) -> bool:
+        """Return whether planned joints move a link."""
+        return bool(self._model.frames[frame_of(self._model, link)].parentJoint)
+
     def check_moves(self, link: str, what: str, *, moves: bool) -> None:
         """Raise SceneError for a link that planned joints move, or for one that they do not move."""
-        if link not in self.links:
-            return
-        frame = self._model.frames[frame_of(self._model, link)]
-        if bool(frame.parentJoint) != moves:
+        if link in self.links and self.moves(link) != moves:
             text = (
                 "a link that planned joints move" if moves else "a frame of the world"
             )
@@ -179,11 +189,24 @@ def _in_world(request: SceneRequest, frames: LinkFrames) -> Iterator[LinkConstra
         yield constraint.moved(*frames.pose(frame, what))
 
 
-def _in_link(item: AttachedObject, frames: LinkFrames) -> AttachedObject:
+def _moving(
+    names: tuple[str, ...], request: SceneRequest, frames: LinkFrames, what: str
+) -> tuple[str, ...]:
+    """Return the links among names that planned joints move, and the attached objects."""
+    carried = {each.name for each in request.attached}
+    for name in names:
+        if name not in carried:
+            frames.check_link(name, what)
+    return tuple(name for name in names if name in carried or frames.moves(name))
+
+
+def _in_link(
+    item: AttachedObject, request: SceneRequest, frames: LinkFrames
+) -> AttachedObject:
     """Return an attached object with the poses of its shapes in the frame of its link."""
     what = f"the attached object {item.name!r}"
-    for link in (item.link, *item.touch_links):
-        frames.check_link(link, what)
+    frames.check_link(item.link, what)
+    _moving(item.touch_links, request, frames, what)
     # T_link_shape = T_base_link^-1 T_base_frame T_frame_shape
     position, rotation = frames.pose(item.link, what)
     shapes = []

@@ -7,15 +7,23 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 from cnpgen.errors import RecipeError, listed
+from cnpgen.problems.constraints.clearance import RobotClearance
 from cnpgen.problems.constraints.joint import JointTorque
+from cnpgen.problems.constraints.link_clearance import SelfClearance
 from cnpgen.problems.load_robot import load_robot
 from cnpgen.problems.problem import Problem
 from cnpgen.problems.problem_record import ProblemRecord, as_problem, record_problem
 from cnpgen.problems.scenes.scene_problem import SceneError, SceneProblem
 from cnpgen.problems.scenes.scene_request import NO_REQUEST, AttachedObject
-from cnpgen.robots.attached_links import attached_link_name, with_attached_link
+from cnpgen.robots.attached_links import (
+    attached_link_name,
+    root_link,
+    with_attached_link,
+    with_padded_link,
+)
 from cnpgen.robots.robot import Robot
 from cnpgen.robots.urdf import urdf_tree
+from cnpgen.robots.urdf_changes import with_ignored_pairs
 from cnpgen.schema.arguments import check_range, number
 from cnpgen.schema.keys import PerJoint
 
@@ -53,12 +61,19 @@ def requested_problem(
         mass = number("payload", payload)
         check_range("payload", mass, MIN_PAYLOAD_KG, MAX_PAYLOAD_KG, "kg")
     first = scenes[0]
+    if payload is not None and all(
+        item.mass or not item.link for item in first.request.attached
+    ):
+        _LOG.warning(
+            "the payload of %g kg is not used: no scene attaches an object of weight 0",
+            payload,
+        )
     _report_held_joints(problem, scenes)
     for scene in scenes:
         if scene.request.changes != first.request.changes:
             raise SceneError(
-                f"{scene.place} has other scaling factors, attached objects or path constraints than"
-                f" {first.place}, and the plans of one call share a problem: choose the"
+                f"{scene.place} has other scaling factors, attached objects, allowed collisions, sizes of links or path"
+                f" constraints than {first.place}, and the plans of one call share a problem: choose the"
                 " scenes of one problem by {first} and {n}",
                 remedies={"first": None, "n": None},
             )
@@ -66,7 +81,7 @@ def requested_problem(
         return problem, robot, list(scenes)
     constraints = *problem.constraint, *first.request.constraints
     changed = _with_scales(problem, robot, first).replaced(constraint=constraints)
-    if first.request.attached:
+    if first.request.attached or first.request.link_sizes:
         objects = [
             _with_mass(item, problem, first, payload) for item in first.request.attached
         ]
@@ -110,6 +125,7 @@ def _without_changes(scene: SceneProblem) -> SceneProblem:
         velocity_scale=NO_REQUEST.velocity_scale,
         acceleration_scale=NO_REQUEST.acceleration_scale,
         attached=(),
+        link_sizes=(),
         constraints=(),
         constraint_frames=(),
     )
@@ -134,6 +150,8 @@ def _with_mass(
     item: AttachedObject, problem: Problem, scene: SceneProblem, payload: float | None
 ) -> AttachedObject:
     """Return an attached object with a mass; an unknown one is refused for problems with torques."""
+    if not item.link:
+        return item
     if item.mass:
         _LOG.info(
             "%s: the weight of the attached object %r, %g, is taken as its mass in kg",
@@ -160,24 +178,66 @@ def _with_objects(
     """Return the problem with attached objects as links."""
     if problem.robot.geometry != "urdf":
         raise SceneError(
-            f"{scene.place} has attached objects, and the problem {problem.name!r} has"
+            f"{scene.place} has attached objects or sizes of links, and the problem {problem.name!r} has"
             ' no link geometry: expected [robot] geometry = "urdf"'
         )
-    record = record_problem(problem)
-    text = record.urdf
+    if not all(item.link for item in objects):
+        _check_clearances(problem, scene)
+    record, names = record_problem(problem), {item.name for item in objects}
+    text, root = record.urdf, root_link(record.urdf)
     try:
         for item in objects:
             text = with_attached_link(
                 text,
                 item.name,
-                item.link,
+                item.link or root,
                 shapes=item.shapes,
                 mass=item.mass,
-                touch_links=item.touch_links,
+                touch_links=[link for link in item.touch_links if link not in names],
             )
+        touching = [
+            (attached_link_name(item.name), attached_link_name(other))
+            for item in objects
+            for other in item.touch_links
+            if other in names
+        ]
+        text = with_ignored_pairs(text, touching) if touching else text
+        text = _with_sizes(text, objects, scene)
     except (RecipeError, ValueError) as error:
         raise SceneError(f"{scene.place}: {error}") from error
     return as_problem(ProblemRecord(record.recipe, text))
+
+
+def _with_sizes(
+    urdf: str, objects: Sequence[AttachedObject], scene: SceneProblem
+) -> str:
+    """Return a URDF with larger copies of links, and of what they carry, that obstacles must not enter."""
+    fixed = [item for item in objects if not item.link]
+    for link, scale, padding in scene.request.link_sizes:
+        bodies = {link: link}
+        bodies |= {
+            item.name: attached_link_name(item.name)
+            for item in objects
+            if item.link == link
+        }
+        for name, body in bodies.items():
+            obstacles = [
+                attached_link_name(item.name)
+                for item in fixed
+                if name not in item.touch_links
+            ]
+            urdf = with_padded_link(urdf, body, scale, padding, obstacles=obstacles)
+    return urdf
+
+
+def _check_clearances(problem: Problem, scene: SceneProblem) -> None:
+    """Raise SceneError if links keep another distance from an object of the world that is a link than from others."""
+    own, others = problem.first(SelfClearance), problem.first(RobotClearance)
+    if own is None or others is None or own.distance != others.distance:
+        raise SceneError(
+            f"{scene.place} allows collisions of links with objects of the world, and the problem"
+            f" {problem.name!r} needs 'self-clearance' with the distance of 'robot-clearance' for it"
+        )
 
 
 def _check_contacts(robot: Robot, scene: SceneProblem) -> None:
@@ -191,8 +251,8 @@ def _check_contacts(robot: Robot, scene: SceneProblem) -> None:
             continue
         other = pair.second if body == pair.first else pair.first
         raise SceneError(
-            f"{scene.place}: the attached object {names[body]!r} overlaps the link"
-            f" {other!r} in every state: name the link in its touch_links",
+            f"{scene.place}: the object {names[body]!r} overlaps the link"
+            f" {other!r} in every state: name the link in its touch_links, or allow their collision",
             concerns="scenes",
         )
 
@@ -202,5 +262,6 @@ def refuse_changes(scenes: Sequence[SceneProblem], why: str) -> None:
     for scene in scenes:
         if scene.request.changes_problem:
             raise SceneError(
-                f"{scene.place} has scaling factors, attached objects or path constraints: {why}"
+                f"{scene.place} has scaling factors, attached objects, allowed collisions, sizes of links or path"
+                f" constraints: {why}"
             )

@@ -18,15 +18,15 @@ MIN_SCALE = 1e-3  # of the limits, as in a problem file
 
 @dataclass(frozen=True, eq=False)
 class AttachedObject:
-    """Object that a link of the robot carries.
+    """Object that a link of the robot carries, or a fixed one that some links may touch.
 
     Attributes:
         name: Name of the object.
-        link: Link that carries it.
+        link: Link that carries it; empty for the base of an object of the world.
         shapes: Its shapes.
         frames: Frame of the pose of each shape, a link of the robot at the start state;
             empty for the robot's base.
-        touch_links: Links that may touch it, beside ``link``.
+        touch_links: Links and attached objects that may touch it, beside ``link``.
         mass: Its mass [kg], 0 if it is unknown.
     """
 
@@ -65,9 +65,14 @@ class SceneRequest:
         obstacle_frames: Frame of the pose of each obstacle; empty for obstacles in the
             frame of the robot's base. Other frames are links of the robot at the start
             state.
+        obstacle_touch_links: Links and attached objects that may touch each obstacle;
+            empty if none may touch any.
         fixed_frames: Frames that the file places, and whether each is the base; only
             the root link of the robot may be one of them.
         attached: Objects that the robot carries.
+        link_sizes: Links that keep clear of obstacles as if they were larger: the
+            factor of their sizes, at least 1, and what these grow by to all sides [m].
+            Attached objects grow with their link.
         constraints: Constraints on every state, in addition to those of the problem.
         constraint_frames: Frame of each of them, which must not move; empty for those
             in the frame of the robot's base.
@@ -83,8 +88,10 @@ class SceneRequest:
     goal_frame: str = ""
     other_goal_frames: tuple[str, ...] = ()
     obstacle_frames: tuple[str, ...] = ()
+    obstacle_touch_links: tuple[tuple[str, ...], ...] = ()
     fixed_frames: tuple[tuple[str, bool], ...] = ()
     attached: tuple[AttachedObject, ...] = ()
+    link_sizes: tuple[tuple[str, float, float], ...] = ()
     constraints: tuple[LinkConstraint, ...] = ()
     constraint_frames: tuple[str, ...] = ()
     accepted: tuple[str, ...] = ()
@@ -96,14 +103,16 @@ class SceneRequest:
     def places(self) -> bool:
         """Whether poses depend on frames of links, or links are named."""
         frames = self.goal_frame, *self.other_goal_frames, *self.obstacle_frames
-        return any((*frames, self.fixed_frames, self.attached, self.constraints))
+        named = self.attached, self.link_sizes, self.constraints
+        touching = any(self.obstacle_touch_links)
+        return touching or any((*frames, self.fixed_frames, *named))
 
     @property
     def changes(self) -> tuple[object, ...]:
-        """Changes of the robot's problem: scaling factors, attached objects and constraints."""
+        """Changes of the robot's problem: scaling factors, attached objects, sizes of links, and constraints."""
         objects = tuple(each.digest for each in self.attached)
         scales = self.velocity_scale, self.acceleration_scale
-        return *scales, objects, self.constraints
+        return *scales, objects, frozenset(self.link_sizes), self.constraints
 
     @property
     def changes_problem(self) -> bool:
@@ -138,9 +147,12 @@ class SceneRequest:
             scale = getattr(self, name)
             if not MIN_SCALE <= scale <= 1:
                 yield f"{name} must be between {MIN_SCALE:g} and 1, got {scale:g}"
-        if len(self.obstacle_frames) not in {0, obstacles}:
-            count = len(self.obstacle_frames)
-            yield f"obstacle_frames must have {obstacles} entries, got {count}"
+        for link, scale, padding in self.link_sizes:
+            if not (1 <= scale < np.inf and 0 <= padding < np.inf):
+                yield f"link_sizes of {link!r} must be at least 1 and 0, got {scale:g} and {padding:g}"
+        for name in ("obstacle_frames", "obstacle_touch_links"):
+            if (count := len(getattr(self, name))) not in {0, obstacles}:
+                yield f"{name} must have {obstacles} entries, got {count}"
 
 
 NO_REQUEST = SceneRequest()

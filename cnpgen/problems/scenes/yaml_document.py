@@ -84,6 +84,8 @@ def _put(stack: list[Any], value: Any) -> Iterator[Any]:
         stack.append((value if isinstance(value, str) else repr(value),))
     else:
         (key,) = stack.pop()
+        if key in stack[-1]:
+            raise ValueError(f"a mapping has the key {key!r:.60} twice")
         stack[-1][key] = value
 
 

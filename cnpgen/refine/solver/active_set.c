@@ -1,6 +1,6 @@
 /* Dual active-set method for quadratic programs (Goldfarb and Idnani, Mathematical Programming 27, 1983): minimize
-x x / 2 + f x subject to low <= a x <= high for every row a. It replaces DAQP. The initial working set is activated at
-once; DAQP adds its rows one after the other. Requires arrays.h.
+x x / 2 + f x subject to low <= a x <= high for every row a. The initial working set is activated at
+once; DAQP would add its rows one after the other. Requires arrays.h.
 
 Arrays of rows are padded with zeros to `stride`, with memory for B more numbers. */
 

@@ -1,10 +1,9 @@
-"""Backend in compiled code, ``step.c`` and ``active_set.c``: equal to the NumPy backend up to rounding, and faster."""
+"""Evaluations of a motion and subproblems of its steps in compiled code: ``step.c`` and ``active_set.c``."""
 
 import ctypes
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from ctypes import c_double, c_int, c_long, c_void_p
 from dataclasses import dataclass
-from functools import partial
 from itertools import accumulate
 from pathlib import Path
 from typing import Any
@@ -26,8 +25,6 @@ from cnpgen.refine.solver.qp_subproblem import (
     QP_TOLERANCE,
     THINNING,
     Mask,
-    NumpyBackend,
-    NumpySubproblem,
     ResidualSelection,
     Step,
 )
@@ -129,38 +126,37 @@ class _Motion(ctypes.Structure):
     )
 
 
-def load_step_library(kernels: KernelLibrary) -> ctypes.CDLL | None:
-    """Return the library of step.c, or None where kernels are not compiled."""
+def load_step_library(kernels: KernelLibrary) -> ctypes.CDLL:
+    """Return the library of step.c.
+
+    Raises:
+        MachineError: It is missing.
+    """
     library = kernels.load_source(*SOURCES)
-    if library is not None:
-        library.evaluate.argtypes, library.evaluate.restype = (c_void_p,) * 3, c_double
-        build = (*(c_void_p,) * 3, *(c_double,) * 4, *(c_void_p,) * 3)
-        library.build_subproblem.restype, library.build_subproblem.argtypes = (
-            None,
-            build,
-        )
-        solve = (
-            *(c_void_p,) * 3,
-            c_double,
-            c_double,
-            c_int,
-            c_void_p,
-            c_double,
-            c_double,
-            c_int,
-            c_void_p,
-            c_void_p,
-        )
-        library.solve_subproblem.argtypes = solve
+    library.evaluate.argtypes, library.evaluate.restype = (c_void_p,) * 3, c_double
+    build = (*(c_void_p,) * 3, *(c_double,) * 4, *(c_void_p,) * 3)
+    library.build_subproblem.restype, library.build_subproblem.argtypes = None, build
+    solve = (
+        *(c_void_p,) * 3,
+        c_double,
+        c_double,
+        c_int,
+        c_void_p,
+        c_double,
+        c_double,
+        c_int,
+        c_void_p,
+        c_void_p,
+    )
+    library.solve_subproblem.argtypes = solve
     return library
 
 
 class CompiledBackend:
-    """Backend of step.c; see ``NumpyBackend``."""
+    """Evaluations and subproblems of a motion within its bounds."""
 
     def __init__(self, motion: Transcription, bounds: Bounds) -> None:
         library = motion.kernels.step_library
-        assert library is not None
         self._evaluate, self._build, self._solve = (
             library.evaluate,
             library.build_subproblem,
@@ -175,10 +171,10 @@ class CompiledBackend:
         )
         self._motion = self._describe(motion, bounds)
         self._address = ctypes.addressof(self._motion)
-        self._fallback, self._activate = NumpyBackend(motion, bounds), motion.activate
+        self._activate = motion.activate
 
     def value(self, x: Array) -> tuple[float, Array, float]:
-        """Evaluate a motion; see ``NumpyBackend``."""
+        """Evaluate the regularized objective, residuals (K, m) and their largest violation."""
         g = np.empty((self._m, self._points))
         self._activate()
         cost = self._evaluate(self._address, address_of(x), address_of(g))
@@ -193,7 +189,10 @@ class CompiledBackend:
         proximal: float,
         penalty: float,
     ) -> "CompiledSubproblem":
-        """Build the subproblem; see ``NumpyBackend``."""
+        """Build the subproblem at x with residuals g.
+
+        It is valid until the next one is built.
+        """
         selected = np.zeros((self._m, self._points), bool)
         missed = np.ascontiguousarray(selection.missed.T)
         before = (
@@ -218,17 +217,8 @@ class CompiledBackend:
             selection.max_log_rate_change,
             *addresses,
         )
-        fallback = partial(
-            self._fallback.subproblem,
-            x,
-            g,
-            selection,
-            proximal=proximal,
-            penalty=penalty,
-        )
         return CompiledSubproblem(
             self,
-            fallback,
             g,
             selected.T,
             penalty * selection.violation + ELASTIC_GRADIENT,
@@ -403,22 +393,20 @@ class CompiledBackend:
 
 @dataclass(frozen=True)
 class CompiledSubproblem:
-    """Subproblem of step.c at an iterate with residuals g; see ``NumpySubproblem``."""
+    """Quadratic model of the objective and linear model of the selected residuals at an iterate with residuals g."""
 
     backend: CompiledBackend
-    fallback: Callable[[], NumpySubproblem]  # builds the same subproblem in NumPy
     g: Array
-    selected: Mask
+    selected: Mask  # residuals in the programs, shape (K, m)
     elastic_gradient: float  # of the elastic variable's cost
 
     def solve(
         self, box: Array, *, warm: Array | None = None, relax: bool = False
     ) -> Step | None:
-        """Return the best step within the box; see ``NumpySubproblem``.
+        """Return the best step within the box of largest changes, shape (nx,), or None without a solution.
 
-        DAQP solves it if active_set.c does not.
+        ``warm`` are the multipliers of the residuals in the initial working set, shape
+        (K, m). With ``relax`` satisfied residuals may be violated, too, up to the
+        remaining largest violation.
         """
-        step = self.backend.solve(self, box, warm, relax=relax)
-        return (
-            self.fallback().solve(box, warm=warm, relax=relax) if step is None else step
-        )
+        return self.backend.solve(self, box, warm, relax=relax)

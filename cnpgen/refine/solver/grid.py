@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cnpgen.arrays import Array
-from cnpgen.trajectory.spline import basis, chebyshev, graded_edges
+from cnpgen.trajectory.spline import basis, basis_tables, chebyshev, graded_edges
 from cnpgen.trajectory.trajectory_spec import TrajectorySpec
 
 Indices = NDArray[np.intp]
@@ -102,14 +102,7 @@ def make_grid(spec: TrajectorySpec, points: int, orders: int = 3) -> Grid:
 
 
 def _bases(spec: TrajectorySpec, s: Array, orders: int) -> Bases:
-    path = [
-        basis(s, spec.path_control_points, spec.degree, order)
-        for order in range(orders)
-    ]
-    rate = [
-        basis(s, spec.rate_control_points, spec.degree, order)
-        for order in range(orders - 1)
-    ]
+    path, rate = basis_tables(spec, s, orders)
     arrays = (
         np.stack(path),
         np.stack(rate),

@@ -1,7 +1,8 @@
 """Levels of the solver on hulls in place of capsules: their problems, residuals, and collisions between grid points.
 
-Where compiled code measures hulls, all levels are of this kind. The kernels are then
-those of the problem without clearances, so that all its scenes share them. A corner
+If hulls replace capsules (``can_measure_hulls``), all levels are of this kind. The
+kernels are then those of the problem without clearances, so that all its scenes share
+them. A corner
 that passes a thin edge may collide between two grid points without a violation at
 either of them. Such collisions are fed back to the solver as larger required distances
 at the neighboring points. Some are found by the verdict only, which names their phase.
@@ -21,8 +22,7 @@ from cnpgen.refine.solver.bounds import (
     near_ends,
 )
 from cnpgen.refine.solver.hulls import LINK_CONSTRAINTS, OBJECT_CONSTRAINTS, Hulls
-from cnpgen.refine.solver.residuals import DISTANCE_SCALE_M
-from cnpgen.refine.solver.transcription import Linearization, Transcription, cache_last
+from cnpgen.refine.solver.transcription import Transcription
 from cnpgen.robots.robot import Robot
 from cnpgen.trajectory.spline import basis
 from cnpgen.trajectory.trajectory_spec import TrajectorySpec
@@ -85,46 +85,11 @@ def without_contacts(problem: Problem) -> Problem:
 
 
 class HullTranscription(Transcription):
-    """A motion with the clearances of the links' hulls as further residuals, evaluated in NumPy.
+    """A motion with the clearances of the links' hulls as further residuals.
 
     The hulls are among obstacles with ``obstacle_poses``, shape (width,), all of those
     of the scene.
     """
-
-    def __init__(
-        self, motion: Transcription, hulls: Hulls, obstacle_poses: Array
-    ) -> None:
-        kernels = replace(motion.kernels, step_library=None)
-        super().__init__(
-            kernels,
-            motion.grid,
-            boundary=motion.boundary,
-            obstacle_poses=motion.obstacle_poses,
-        )
-        self._hulls = hulls
-        self._measure = cache_last(lambda w: hulls.measure(w[: self.n], obstacle_poses))
-
-    def measured(self, x: Array) -> tuple[float, Array]:
-        """Evaluate the objective and residuals (K, m + columns)."""
-        cost, g = super().measured(x)
-        return cost, np.hstack([g, self._measure(self._at(x)[0])[0] / DISTANCE_SCALE_M])
-
-    def evaluate(self, x: Array) -> Linearization:
-        """Evaluate objective and residuals with their derivatives."""
-        at, (w, _, _) = super().evaluate(x), self._at(x)
-        distances, groups = self._measure(w)
-        gradients = np.zeros((len(w), len(self._hulls.min_distances), w.shape[1]))
-        gradients[: self.n] = (
-            self._hulls.gradients(w[: self.n], distances, groups) / DISTANCE_SCALE_M
-        )
-        jacobian = np.concatenate([at.jacobian, gradients], axis=1)
-        return replace(
-            at, g=np.hstack([at.g, distances / DISTANCE_SCALE_M]), jacobian=jacobian
-        )
-
-
-class CompiledHullTranscription(Transcription):
-    """Such a motion with compiled kernels and hulls, see ``HullTranscription``."""
 
     def __init__(
         self, motion: Transcription, hulls: Hulls, obstacle_poses: Array

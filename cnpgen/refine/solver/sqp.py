@@ -41,8 +41,6 @@ from cnpgen.refine.solver.bounds import Bounds
 from cnpgen.refine.solver.compiled_backend import CompiledBackend, CompiledSubproblem
 from cnpgen.refine.solver.qp_subproblem import (
     Mask,
-    NumpyBackend,
-    NumpySubproblem,
     ResidualSelection,
     Step,
     local_maxima,
@@ -180,14 +178,6 @@ def minimize(
     )
 
 
-def make_backend(
-    motion: Transcription, bounds: Bounds
-) -> NumpyBackend | CompiledBackend:
-    """Return the backend of a motion: compiled if its kernels are, else NumPy."""
-    compiled = motion.kernels.step_library is not None
-    return CompiledBackend(motion, bounds) if compiled else NumpyBackend(motion, bounds)
-
-
 class _Iterate:
     """State of the iteration: variables, regularized objective, largest violation."""
 
@@ -198,7 +188,7 @@ class _Iterate:
     def __init__(
         self, motion: Transcription, bounds: Bounds, settings: Settings, x: Array
     ) -> None:
-        self._backend, self._motion = make_backend(motion, bounds), motion
+        self._backend, self._motion = CompiledBackend(motion, bounds), motion
         self._corrections = MAX_MIDPOINT_CORRECTIONS
         self.x = self._start = x
         self.cost, self._g, self.violation = self._backend.value(x)
@@ -302,7 +292,7 @@ class _Iterate:
             STALL_FRACTION * smallest, tolerance
         )
 
-    def _propose(self, subproblem: NumpySubproblem | CompiledSubproblem) -> Step | None:
+    def _propose(self, subproblem: CompiledSubproblem) -> Step | None:
         """Solve the subproblem; solve it again, relaxed or without warm start, if the step is of little use."""
         box = self._radius * self._scale
         step = subproblem.solve(box, warm=self._multipliers)
@@ -386,7 +376,7 @@ class _Iterate:
             self._corrections - 1,
             tighter,
         )
-        self._backend = make_backend(self._motion, tighter)
+        self._backend = CompiledBackend(self._motion, tighter)
         self.violation = tighter.max_violation(self._g)
 
     def _reject(self, violations: Array, selected: Mask, size: float) -> None:

@@ -235,7 +235,7 @@ double evaluate(motion *s, const double *x, double *g) {
   return duration(s, x + s->nx - s->rate, 0) + (s->cost_residuals ? cost_term(s, 0) : 0);
 }
 
-/* ---- Quadratic subproblem (NumpyBackend and NumpySubproblem) ---- */
+/* ---- Quadratic subproblem (qp_subproblem.py) ---- */
 
 /* Factor the Hessian with the proximal term, with inverted diagonal. Rows divided by the factor are those of variables
 with unit Hessian. */

@@ -60,14 +60,12 @@ class ResidualKernels:
     spec: TrajectorySpec  # degree and numbers of control points
     values: Kernel  # kernel of ``cnpgen.refine.solver.residuals.stage_values``
     jacobian: Kernel  # kernel of ``cnpgen.refine.solver.residuals.stage_jacobian``
+    step_library: CDLL  # library of ``cnpgen.refine.solver.compiled_backend``
     cost_term: CostTerm | None = None  # cost term in addition to the duration, or None
     # Kernel of ``cnpgen.refine.solver.residuals.cost_term_residuals``, or None.
     cost_residuals: Kernel | None = None
     # Number of residuals of every term of the cost term.
     cost_counts: tuple[int, ...] = ()
-    # Library of ``cnpgen.refine.solver.compiled_backend``, or None for the NumPy
-    # backend.
-    step_library: CDLL | None = None
 
 
 class Transcription:

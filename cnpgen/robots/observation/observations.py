@@ -1,26 +1,20 @@
-"""Observations of scenes and their NumPy reference: clouds, views, signed distances, basis points and tokens."""
+"""Observations of scenes: clouds, views, signed distances, basis points and tokens."""
 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import ClassVar
+from typing import ClassVar, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from cnpgen.arrays import AnyArray
 from cnpgen.errors import UsageError, nearest
-from cnpgen.robots.observation.camera import Camera, depth_image, depth_points
-from cnpgen.robots.observation.primitives import (
-    KINDS,
-    MESH,
-    Primitives,
-    bodies_of,
-    smallest_signed_distances,
-)
-from cnpgen.robots.observation.surface_points import Seeds, surface_points
+from cnpgen.robots.observation.camera import Camera
+from cnpgen.robots.observation.primitives import KINDS, MESH, Primitives
+from cnpgen.robots.observation.surface_points import Seeds
 from cnpgen.schema.argument_types import check_fields
 from cnpgen.schema.arguments import integer
 
@@ -33,11 +27,8 @@ MIN_GRID_EXTENT_M = 1e-6
 WORKSPACE = (-0.9, -0.9, -0.1), (0.9, 0.9, 1.1)
 
 
-class ObservationBackend:
-    """Functions of N scenes, which are primitives with a first axis of length N: the NumPy reference.
-
-    Compiled code overrides each of them.
-    """
+class ObservationBackend(Protocol):
+    """Functions of N scenes, which are primitives with a first axis of length N."""
 
     def distances(self, scenes: Primitives, points: AnyArray) -> Values:
         """Return the smallest signed distance of points from the bodies of each scene [m], shape (N, P).
@@ -45,45 +36,28 @@ class ObservationBackend:
         Points in the world frame [m] have shape (P, 3) for all scenes or (N, P, 3).
         Without bodies distances are inf.
         """
-        points = np.broadcast_to(points, (len(scenes), *points.shape[-2:]))
-        parts = [
-            smallest_signed_distances(bodies_of(scenes, i), points[i])
-            for i in range(len(scenes))
-        ]
-        return _stacked(parts, points.shape[1:2])
 
     def surface_points(self, scenes: Primitives, count: int, seeds: Seeds) -> Values:
         """Return points on the surfaces of each scene [m], shape (N, count, 3).
 
-        See ``surface_points``.
+        Their density is uniform in area, and they are ordered by body; nan without
+        bodies. Points inside of another body are kept. Within a part of a surface they
+        form a Kronecker sequence, which is more even than random points.
         """
-        parts = [
-            surface_points(bodies_of(scenes, i), count, seeds[i])
-            for i in range(len(scenes))
-        ]
-        return _stacked(parts, (count, 3))
 
     def depth_images(self, scenes: Primitives, camera: Camera) -> Values:
-        """Return depth images [m], shape (N, height, width); see ``depth_image``."""
-        parts = [depth_image(bodies_of(scenes, i), camera) for i in range(len(scenes))]
-        return _stacked(parts, (camera.height, camera.width))
+        """Return distances along the camera's axis at the centers of the pixels [m], shape (N, height, width).
+
+        Pixels that see no body have inf. Bodies that contain the camera are not seen.
+        """
 
     def depth_points(
         self, depth: Values, camera: Camera, count: int, seeds: Seeds
     ) -> Values:
-        """Return points of depth images [m], shape (N, count, 3).
+        """Return points of depth images [m], evenly distributed over the pixels that see a body, shape (N, count, 3).
 
-        See ``depth_points``.
+        They repeat if there are fewer such pixels, and are nan if there are none.
         """
-        parts = [
-            depth_points(image, camera, count, seed)
-            for image, seed in zip(depth, seeds, strict=True)
-        ]
-        return _stacked(parts, (count, 3))
-
-
-def _stacked(parts: list[AnyArray], shape: tuple[int, ...]) -> Values:
-    return np.array(parts, np.float32).reshape(len(parts), *shape)
 
 
 class Observation(ABC):

@@ -95,20 +95,6 @@ class ConvexMesh:
             np.minimum(smallest, squared, out=smallest)
         return smallest
 
-    def entries(self, origin: Array, rays: Array) -> Array:
-        """Return where rays from an origin [m], shape (P, 3), enter, in ray lengths, shape (P,); nan for none."""
-        enter, leave = np.full(len(rays), -np.inf), np.full(len(rays), np.inf)
-        for plane in self.planes:
-            # A ray enters through planes that it approaches, and leaves through the
-            # others.
-            speed = rays @ plane[:3]
-            with np.errstate(all="ignore"):
-                crossing = -(plane[:3] @ origin + plane[3]) / speed
-            enter = np.where(speed < 0, np.fmax(enter, crossing), enter)
-            # -inf for rays along a face, outside of it
-            leave = np.where(speed < 0, leave, np.fmin(leave, crossing))
-        return np.where(enter <= leave, enter, np.nan)
-
 
 def _squared_from_segment(offsets: Array, edge: Array) -> Array:
     """Return squared distances from a segment of points relative to its start, shape (P,)."""
@@ -300,12 +286,6 @@ def _padding(*shape: int) -> tuple[NDArray[np.int64], Array, Array, Array]:
     )
 
 
-def bodies_of(scenes: Primitives, index: int) -> Primitives:
-    """Return the bodies of one of N scenes, without padding."""
-    scene = scenes[index]
-    return scene[scene.kinds >= 0]
-
-
 def signed_distances(primitives: Primitives, points: Array) -> Array:
     """Compute the signed distances of P world points from M primitives [m], negative inside, shape (M, P)."""
     distances = np.empty((len(primitives), len(points)))
@@ -325,18 +305,6 @@ def signed_distances(primitives: Primitives, points: Array) -> Array:
                 mesh.distances(local) if mesh else _distance(kind, size, local)
             )
     return distances
-
-
-def smallest_signed_distances(primitives: Primitives, points: Array) -> Array:
-    """Compute the smallest signed distance of points from any primitive [m], shape (P,); inf without primitives."""
-    smallest = np.full(len(points), np.inf)
-    for index in range(len(primitives)):
-        np.minimum(
-            smallest,
-            signed_distances(primitives[np.array([index])], points)[0],
-            out=smallest,
-        )
-    return smallest
 
 
 def _distance(kind: int, size: Array, local: Array) -> Array:

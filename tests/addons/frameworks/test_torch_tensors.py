@@ -221,6 +221,18 @@ def test_the_loss_can_be_compiled() -> None:
     )
 
 
+@pytest.mark.parametrize("name", ["heavy-object", "heavy-object-drive"])
+def test_motor_torques_equal_those_of_the_model(name: str) -> None:
+    """Without drives, both are the torques of the rigid body."""
+    model, robot = RobotModel(name, backend="numpy"), TensorRobot(name)
+    q, dq, ddq = np.random.default_rng(5).uniform(-0.3, 0.3, (3, 50, 7))
+    found = robot.motor_torque(*map(tensor, (q, dq, ddq)))
+    low, high = model.motor_torque(q, dq, ddq)
+    for got, wanted in zip(found, (low, high), strict=True):
+        np.testing.assert_allclose(array(got), wanted, rtol=1e-9, atol=1e-9)
+    assert (high > low).all() == (name == "heavy-object-drive")
+
+
 @pytest.mark.parametrize("label", LABELS)
 def test_the_robot_equals_the_compiled_one(label: str) -> None:
     model, robot = (

@@ -92,6 +92,7 @@ def test_the_card_states_limits_constraints_frame_date_and_what_a_sample_proves(
     ):
         assert re.search(rf"\| `{name}` \|.* \| {limit:.5g} rad/s \|", card)
     assert "| `table` | tolerance 0.001, x [0.6, 2], y [-0.45, 0.45]" in card
+    assert "- torque: rigid body\n" in card
     assert "- frame: positions in the frame `world`, tip link `striker_tip`" in card
     created = json.loads((dataset / "manifest.json").read_text())["created"]
     assert f"- date: {created[:10]}" in card

@@ -10,12 +10,12 @@ import pytest
 from cnpgen.addons.init.arm import arm_notes, read_arm
 from cnpgen.addons.init.initial_recipes import InitialProblem, problem_of
 from cnpgen.addons.init.joint_limits import read_joint_limits, with_joint_limits
-from cnpgen.addons.init.urdf_elements import unread_elements
 from cnpgen.cli.main import main
 from cnpgen.errors import RecipeError, UsageError
 from cnpgen.problems.load_robot import load_robot
 from cnpgen.robots.robot import Robot
 from cnpgen.robots.urdf import urdf_tree
+from cnpgen.robots.urdf_elements import _KNOWN, check_elements, unread_elements
 
 BOX = '<geometry><box size="0.4 0.08 0.08"/></geometry>'
 INERTIA = '<inertia ixx="0.01" ixy="0" ixz="0" iyy="0.06" iyz="0" izz="0.06"/>'
@@ -165,6 +165,14 @@ def test_followers_of_a_locked_joint_have_their_offset(tmp_path: Path) -> None:
             "link upper: <origin rpy> has the angle 90 rad; 90 deg would be 1.571 rad",
         ),
         (
+            {"limit": LIMIT.replace('lower="-2"', "")},
+            "joint j1: its <limit> has no 'lower', which means 0",
+        ),
+        (
+            {"more": finger().replace('<axis xyz="0 0 1"/>', "")},
+            "joint g1: it has no <axis>, so that it moves along or about 1 0 0",
+        ),
+        (
             {"upper": UPPER.replace("0.2 0 0", "1.4 0 0") + SHAPE},
             "link upper: its center of mass is 1.4 m from its origin, the link reaches 0.45 m",
         ),
@@ -285,6 +293,9 @@ def test_limits_of_moveit_replace_those_of_the_urdf(tmp_path: Path) -> None:
     assert robot.acceleration_limit[0] == 3.0
     assert robot.acceleration_limit[1] == usual.acceleration_limit[1]
     assert robot.jerk_limit.tolist() == [300.0, 44.0]
+    notes = "\n".join(arm_notes(arm))
+    assert "j2: max_velocity is not used, since has_velocity_limits is not" in notes
+    assert "limits.yaml: default_velocity_scaling_factor is not used" in notes
 
 
 @pytest.mark.parametrize(
@@ -313,19 +324,84 @@ def test_faults_in_limits_of_moveit_are_named(
 
 def test_what_is_not_read_is_listed(tmp_path: Path) -> None:
     more = "<gazebo/><gazebo><plugin a='1'/></gazebo><sensor name='eye'/><material name='red'/>"
-    limit = LIMIT.replace("effort", "efort") + "<limts/>"
-    shape = SHAPE.replace("collision", "colision") + SHAPE
+    limit = LIMIT.replace("/>", ' gear="3"/>') + "<hardwareInterface/>"
+    shape = SHAPE + "<verbose/>"
     path = write(tmp_path / "arm.urdf", upper=UPPER + shape, limit=limit, more=more)
     notes = list(unread_elements(urdf_tree(path.read_text())))
     assert (
         notes[0]
         == "elements of other software are not read: <gazebo> (2), <sensor> (1)"
     )
-    text = "\n".join(notes[1:])
-    assert "<colision> in <link>" in text
-    assert "'collision'" in text
-    assert "<limts> in <joint>" in text
-    assert "the attribute 'efort' of <limit>" in text
-    assert len(notes) == 4
+    assert notes[1:] == [
+        "<hardwareInterface> in <joint> is not read, 1 time",
+        "<verbose> in <link> is not read, 1 time",
+        "the attribute 'gear' of <limit> is not read, 1 time",
+    ]
+    load_robot(initial(path).problem)
     plain = write(tmp_path / "plain.urdf")
     assert not list(unread_elements(urdf_tree(plain.read_text())))
+
+
+@pytest.mark.parametrize(
+    ("changes", "text"),
+    [
+        (
+            {"upper": UPPER + SHAPE.replace("collision", "colision") + SHAPE},
+            "<colision> in <link> (did you mean 'collision'?)",
+        ),
+        (
+            {"limit": LIMIT.replace("effort", "efort")},
+            "the attribute 'efort' of <limit> (did you mean 'effort'?)",
+        ),
+        (
+            {"limit": LIMIT + "<safety_controler soft_upper_limit='1'/>"},
+            "<safety_controler> in <joint> (did you mean 'safety_controller'?)",
+        ),
+        (
+            {"upper": UPPER.replace("inertial", "inertal") + SHAPE},
+            "<inertal> in <link> (did you mean 'inertial'?)",
+        ),
+        ({"more": "<Link name='x'/>"}, "<Link> in <robot> (did you mean 'link'?)"),
+    ],
+)
+def test_misspelt_elements_of_a_urdf_are_refused(
+    tmp_path: Path, changes: dict[str, str], text: str
+) -> None:
+    path = write(tmp_path / "a.urdf", **changes)
+    with pytest.raises(RecipeError, match=re.escape(text)):
+        initial(path)
+
+
+def test_a_name_beside_the_one_that_it_resembles_is_not_misspelt() -> None:
+    limit = "<joint><limit velocity='1' gear_velocity='9'/></joint>"
+    check_elements(urdf_tree(f"<robot>{limit}</robot>"), Path("arm.urdf"))
+    other = limit.replace(" velocity", " v")
+    with pytest.raises(RecipeError, match=r"arm.urdf: the attribute 'gear_velocity'"):
+        check_elements(urdf_tree(f"<robot>{other}</robot>"), Path("arm.urdf"))
+
+
+def chain_to(tag: str) -> list[str]:
+    """Return the tags from the root of a URDF to an element."""
+    parents: dict[str, str] = {}
+    for parent, names in _KNOWN.items():
+        for name in names:
+            parents.setdefault(name, parent)
+    tags = [tag]
+    while tags[0] != "robot":
+        tags.insert(0, parents[tags[0]])
+    return tags
+
+
+@pytest.mark.parametrize("tag", _KNOWN)
+def test_every_misspelt_name_of_a_urdf_is_refused(tag: str) -> None:
+    opening = "".join(f"<{each}>" for each in chain_to(tag))
+    closing = "".join(f"</{each}>" for each in chain_to(tag)[::-1])
+    for name in _KNOWN[tag]:
+        for wrong in (f"{name}q", name.capitalize()[:-1] + name[-1:] * 2):
+            for part in (f"<{wrong}/>", opening.removesuffix(">")):
+                text = f"{opening}{part}{closing}"
+                if part != f"<{wrong}/>":
+                    text = f"{part} {wrong}='1'>{closing}"
+                with pytest.raises(RecipeError, match=f"{wrong}.*did you mean"):
+                    check_elements(urdf_tree(text), Path("arm.urdf"))
+        check_elements(urdf_tree(f"{opening}{closing}"), Path("arm.urdf"))

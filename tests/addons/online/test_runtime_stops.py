@@ -8,7 +8,7 @@ import pinocchio as pin
 import pytest
 
 from cnpgen.addons.online.motion_check import MotionChecker
-from cnpgen.addons.online.plan_hits import plan_hits
+from cnpgen.addons.online.plan_hits import HitOptions, plan_hits
 from cnpgen.addons.online.plan_runtime import PlanRuntime
 from cnpgen.addons.online.set_points import sample_motion
 from cnpgen.addons.online.stops import earliest_stop
@@ -21,6 +21,7 @@ from cnpgen.problems.problem_record import open_problem
 from cnpgen.refine.refine_plans import solve_plans
 from tests.conftest import some
 from tests.examples.example_robots import needs_robots
+from tests.faults.chunk_orders import run_chunk_orders
 from tests.faults.stop_orders import check_states, run_orders, valid_plans
 
 TARGET = [2.49, 0.0]  # m
@@ -233,10 +234,31 @@ def test_motions_end_without_an_acceleration_and_report_the_additional_time(
 
 def test_hits_with_a_way_back_are_accepted_by_default(planner):
     home, still = planner.robot.home, np.zeros(6)
-    for puck in ([0.9, 0.1], [1.0, 0.3], [1.1, -0.2], [1.2, 0.0]):
+    random = np.random.default_rng(0)
+    pucks = random.uniform([0.8, -0.4], [1.2, 0.4], (40, 2))
+    # A hit that is invalid at 0.98 of the highest speed.
+    pucks[0] = 0.94604407, 0.00477811
+    for puck in pucks:
         hits = plan_hits(planner, (home, still, still), puck, TARGET, home=home)
-        switch = PlanRuntime(planner, home).switch(hits, 0.0)
-        assert switch.accepted, switch
+        switch = PlanRuntime(planner, home, keep_stops=False).switch(hits, 0.0)
+        assert switch.accepted, (puck, switch)
+
+
+def test_hits_that_are_invalid_at_the_default_speed_are_slower(planner):
+    home, still = planner.robot.home, np.zeros(6)
+    pucks = [[0.94604407, 0.00477811], [1.0, 0.1]]
+    state = (home, still, still)
+    fast = HitOptions(speed_share=0.98)
+    asked = plan_hits(planner, state, pucks, TARGET, home=home, options=fast)
+    found = plan_hits(planner, state, pucks, TARGET, home=home)
+    assert evaluate_plans(asked.plans).valid.tolist() == [False, True]
+    assert evaluate_plans(found.plans).valid.all()
+    speeds = (hits.plans.columns["hit_speed"] for hits in (found, asked))
+    share = np.divide(*speeds)
+    assert share[0] <= 0.98
+    assert share[1] == 1.0
+    unreachable = plan_hits(planner, state, [3.0, 0.0], TARGET, home=home)
+    assert len(unreachable.plans) == 0
 
 
 def test_a_failed_replan_gives_its_reason(planner, executing):
@@ -328,6 +350,12 @@ def test_nothing_changes_after_a_stop_in_any_order_of_requests():
     outcome = run_orders(5, seed=2026)
     assert outcome.findings == []
     assert outcome.requests["stop, ACCEPTED"] >= 2
+
+
+def test_no_chunk_changes_a_motion_after_a_stop_in_any_order_of_requests():
+    outcome = run_chunk_orders(5, seed=2026)
+    assert outcome.findings == []
+    assert outcome.requests["chunk, STOPPED"] >= 2
 
 
 def test_a_stop_that_is_being_computed_is_finished_before_the_runtime_resumes(

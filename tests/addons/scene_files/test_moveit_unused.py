@@ -129,6 +129,8 @@ EQUIVALENT = {  # values that mean the same as those of the documents, or the el
     "rich": {
         "world.collision_objects.operation": "APPEND to a new object adds it",
         "world.octomap.octomap.data": "more cells that are free",
+        "link_padding.link_name": "a padding of 0",
+        "link_scale.link_name": "a scale of 1",
         "start_state.multi_dof_joint_state.transforms.rotation.w": "-q is q",
     },
     "plain": {
@@ -224,8 +226,6 @@ OTHER = {  # entry of the tables -> place in the document, and another value
         ("robot_state", "multi_dof_joint_state", "header"),
         header("map"),
     ),
-    "link_padding.link_name": (("link_padding", 0, "link_name"), "finger"),
-    "link_scale.link_name": (("link_scale", 0, "link_name"), "finger"),
     "path_constraints.name": (("path_constraints", "name"), "none"),
     "octomap.octomap.header": (("world", "octomap", "octomap", "header"), header("x")),
     "collision_objects.type": (("world", "collision_objects", 0, "type"), {"key": "c"}),
@@ -327,13 +327,17 @@ def test_the_docs_print_the_tables() -> None:
             [{"name": "x"}],
             "trajectory_constraints is",
         ),
-        (("link_padding", 0, "padding"), 0.02, "link_padding is 0.02: expected 0"),
-        (("link_scale", 0, "scale"), 1.1, "link_scale is 1.1: expected 1"),
+        (
+            ("link_padding", 0, "padding"),
+            -0.02,
+            "link_padding is -0.02: expected 0 to 1 for",
+        ),
+        (("link_scale", 0, "scale"), 0.9, "link_scale is 0.9: expected 1 to"),
         (("is_diff",), True, "is_diff is 'True': the file must have the whole scene"),
         (
             ("allowed_collision_matrix",),
-            {"default_entry_names": ["box"], "default_entry_values": [True]},
-            "allowed_collision_matrix is 'box and all others'",
+            {"default_entry_names": ["cup"], "default_entry_values": [True]},
+            "allowed_collision_matrix is 'cup and all others'",
         ),
         (("start_state", "is_diff"), False, "detaches them"),
         (
@@ -382,3 +386,93 @@ def test_unread_elements_are_found_in_lists_and_mappings() -> None:
         UsageError, match=r"file has 3 unknown elements, a\[0\]\.c, a\[1\], e"
     ):
         account.finish(wrapped)
+
+
+def write(folder: Path, **files: dict[str, Any]) -> Path:
+    """Write documents as files of a folder; JSON is YAML."""
+    for name, content in files.items():
+        (folder / f"{name}.yaml").write_text(json.dumps(content))
+    return folder
+
+
+def test_an_error_of_a_request_names_its_file(tmp_path: Path) -> None:
+    content = minimal()
+    scene = {"world": content.pop("world")}
+    write(tmp_path, scene1=scene, request1=content | {"max_velocity_scale": 0.1})
+    with pytest.raises(UsageError, match=r"request1.yaml has 1 unknown element, max_v"):
+        load_scenes(tmp_path / "scene1.yaml")
+    write(tmp_path, scene1=scene | {"nam": "x"}, request1=content)
+    with pytest.raises(UsageError, match=r"scene1.yaml has 1 unknown element, nam "):
+        load_scenes(tmp_path / "request1.yaml")
+    request = content | {"max_cartesian_speed": 0.1}
+    write(tmp_path, scene1=scene | {"nam": "x"}, request1=request)
+    (read,) = load_scenes(tmp_path, allow_unused=["nam", "max_cartesian_speed"])
+    assert read.request.accepted == ("nam", "max_cartesian_speed")
+
+
+@pytest.mark.parametrize("key", ["goal_constraints", "world"])
+def test_a_misspelt_key_of_a_whole_part_is_named(tmp_path: Path, key: str) -> None:
+    content = minimal()
+    content[key[:-1]] = content.pop(key)
+    write(tmp_path, kitchen=content)
+    for path in (tmp_path, tmp_path / "kitchen.yaml"):
+        hint = rf"unknown: {key[:-1]} \(did you mean '{key}'\?\)"
+        with pytest.raises(UsageError, match=hint):
+            load_scenes(path)
+
+
+def test_a_start_state_without_a_goal_is_refused(tmp_path: Path) -> None:
+    write(tmp_path, a=minimal(), b={"start_state": minimal()["start_state"]})
+    with pytest.raises(UsageError, match=r"b.yaml: the start_state has no request"):
+        load_scenes(tmp_path)
+
+
+def test_files_of_a_folder_without_scenes_are_named(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    write(tmp_path, a=minimal(), b={"colision_objects": []})
+    assert len(load_scenes(tmp_path)) == 1
+    assert "b.yaml has no scene and is not used" in caplog.text
+
+
+def test_keys_that_occur_twice_are_refused(tmp_path: Path) -> None:
+    file = tmp_path / "a.yaml"
+    file.write_text("start_state: {}\nworld: {}\nworld: {}\n")
+    with pytest.raises(UsageError, match="a mapping has the key 'world' twice"):
+        load_scenes(file)
+    text = json.dumps(minimal())
+    file.write_text(f"{text}\n---\n{text}\n")
+    with pytest.raises(UsageError, match="several documents with goal_constraints"):
+        load_scenes(file)
+
+
+def test_options_that_no_scene_needs_are_named(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    file = write(tmp_path, a=minimal()) / "a.yaml"
+    present = {"a": 0.3, "b": 0.4}
+    load_scenes(file, present=present, packages=[tmp_path])
+    assert "no scene names a mesh file: the packages are not needed" in caplog.text
+    assert "the present state of the robot (start) is not used" in caplog.text
+    caplog.clear()
+    write(tmp_path, a=minimal() | {"start_state": {}})
+    (scene,) = load_scenes(file, present=present)
+    assert scene.start_q.tolist() == [0.3, 0.4]
+    assert not caplog.text
+    with pytest.raises(UsageError, match="must be folders, there is no"):
+        load_scenes(file, packages=[tmp_path / "none"])
+
+
+@pytest.mark.parametrize("weight", ["nan", "inf", -1, "much"])
+@pytest.mark.parametrize(
+    "place",
+    [
+        ("goal_constraints", 0, "joint_constraints"),
+        ("goal_constraints", 1, "position_constraints"),
+        ("goal_constraints", 1, "orientation_constraints"),
+    ],
+    ids=str,
+)
+def test_a_weight_that_is_no_weight_is_refused(place: Place, weight: Any) -> None:
+    with pytest.raises(UsageError, match="weight must be"):
+        read(changed(document(), (*place, 0, "weight"), weight))

@@ -1,9 +1,13 @@
 """Observations of scenes: compiled code against NumPy, Coal and geometry."""
 
+from collections.abc import Callable
+from pathlib import Path
+
 import numpy as np
 import pytest
 
-from cnpgen.errors import UsageError
+from cnpgen.errors import MachineError, UsageError
+from cnpgen.kernels import c_library
 from cnpgen.kernels.observation.compiled_observations import observation_backend
 from cnpgen.loader.batch import Batch
 from cnpgen.loader.batch_options import BatchOptions
@@ -12,9 +16,13 @@ from cnpgen.problems.obstacles import scene_of
 from cnpgen.problems.problem_record import as_problem
 from cnpgen.problems.scenes.scene_problem import make_mesh
 from cnpgen.recipes import Obstacle
-from cnpgen.robots.observation.camera import depth_image
-from cnpgen.robots.observation.observations import OBSERVATIONS, Observation
-from cnpgen.robots.observation.primitives import KINDS, bodies_of, signed_distances
+from cnpgen.robots.observation.observations import (
+    OBSERVATIONS,
+    Observation,
+    ObservationBackend,
+)
+from cnpgen.robots.observation.primitives import KINDS, signed_distances
+from cnpgen.robots.observation.surface_points import scene_seeds
 from cnpgen.robots.scene import PARKED_POSITION_M, Scene
 from cnpgen.robots.shape.convex_part import turned
 from cnpgen.robots.shape.hull import CUBE, coal_hull
@@ -32,6 +40,11 @@ from cnpgen.scenes import (
     scene_bodies,
 )
 from tests.conftest import needs_compiler
+from tests.examples.numpy_observations import (
+    NumpyObservations,
+    bodies_of,
+    depth_image,
+)
 
 CAMERA = Camera(position=(2.0, 1.0, 1.5), width=64, height=48)
 SMALL = (
@@ -90,10 +103,8 @@ def scenes() -> list[tuple[Obstacle, ...]]:
 @needs_compiler
 @pytest.mark.parametrize("kind", SMALL, ids=lambda kind: kind.name)
 def test_compiled_observations_equal_the_numpy_reference(kind: Observation) -> None:
-    compiled, reference = (
-        observe(scenes(), kind, seed=5, backend=backend)
-        for backend in ("compiled", "numpy")
-    )
+    compiled, bodies = observe(scenes(), kind, seed=5), scene_bodies(scenes())
+    reference = kind.observe(bodies, scene_seeds(5, len(bodies)), NumpyObservations())
     for name, values in compiled.items():
         assert values.dtype == reference[name].dtype
         np.testing.assert_allclose(values, reference[name], rtol=0, atol=2e-5)
@@ -161,6 +172,15 @@ def test_distances_agree_with_coal() -> None:
         assert distance == pytest.approx(smallest, abs=5e-6)
 
 
+def test_without_compiled_code_the_error_names_the_compiler(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, fresh_compiler: None
+) -> None:
+    monkeypatch.setattr(c_library, "BUILT_FOLDER", tmp_path / "none")
+    monkeypatch.setenv("CC", "no-such-compiler")
+    with pytest.raises(MachineError, match="observe is missing: no C compiler found"):
+        observe(scenes(), "cloud")
+
+
 def test_a_camera_sees_the_nearest_surface_only() -> None:
     bodies = bodies_of(scene_bodies(scenes()), 1)
     depth = depth_image(bodies, CAMERA)
@@ -185,12 +205,13 @@ def test_a_camera_sees_the_nearest_surface_only() -> None:
     )
 
 
+@needs_compiler
 @pytest.mark.parametrize(
-    "backend", [pytest.param("compiled", marks=needs_compiler), "numpy"]
+    "make_backend", [observation_backend, NumpyObservations], ids=["compiled", "numpy"]
 )
 @pytest.mark.parametrize("shift", [(0.0, 0.3, 0.0), (0.0, 0.0, 0.2), (0.1, 0.1, -0.1)])
 def test_a_mesh_is_seen_as_the_box_of_its_corners_also_along_its_faces(
-    backend: str, shift: tuple[float, ...]
+    make_backend: Callable[[], ObservationBackend], shift: tuple[float, ...]
 ) -> None:
     """The rows and columns of a camera along an axis contain rays that are parallel to faces."""
     along = Camera(
@@ -222,7 +243,7 @@ def test_a_mesh_is_seen_as_the_box_of_its_corners_also_along_its_faces(
             place="",
         )
         images = [
-            observation_backend(backend).depth_images(scene_bodies([(each,)]), along)
+            make_backend().depth_images(scene_bodies([(each,)]), along)
             for each in (box, mesh)
         ]
         seen = np.isfinite(images[0]) & np.isfinite(images[1])

@@ -14,7 +14,13 @@ from cnpgen.errors import UsageError
 from cnpgen.problems.load_robot import load_robot
 from cnpgen.problems.problem_file import load_problem
 from cnpgen.problems.scenes.placement import placed_scene
-from cnpgen.scenes import SceneError, SceneProblem, load_scenes, observe
+from cnpgen.scenes import (
+    SceneError,
+    SceneProblem,
+    load_scenes,
+    observe,
+    solve_scenes,
+)
 from tests.examples.example_robots import needs_robots
 
 START = [0.0, -0.785, 0.0, -2.356, 0.0, 1.571, 0.785]
@@ -110,6 +116,17 @@ def test_the_world_frame_of_robometrics_is_a_link_of_the_robot(tmp_path: Path) -
     other = load(tmp_path, with_value(("world_frame",), "table"))
     with pytest.raises(SceneError, match="in the frame 'table', which the robot lacks"):
         placed_scene(other, robot, start)
+
+
+@needs_robots
+def test_a_goal_pose_beside_goal_states_is_listed_and_names_a_frame(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    caplog.set_level("INFO", "cnpgen")
+    scene = load(tmp_path, with_value(("goal_pose", "frame"), "panda_hnd"))
+    assert "not used: goal_pose" in caplog.text
+    with pytest.raises(SceneError, match="the robot has no frame 'panda_hnd'"):
+        solve_scenes("panda", [scene])
 
 
 def hdf5(folder: Path, **changes: Any) -> Path:

@@ -417,3 +417,29 @@ SPHERE = [{"type": "sphere", "dimensions": [1.0]}]
 def test_constraints_that_are_not_supported_are_refused(tmp_path, robot, paths, text):
     with pytest.raises((SceneError, UsageError), match=text):
         constrained(tmp_path, robot, request(path_constraints=paths))
+
+
+def test_several_constraints_of_one_kind_hold_and_are_stored(tmp_path, robot):
+    region = {"primitives": [{"type": 1, "dimensions": [0.2] * 3}]}
+    region["primitive_poses"] = [{"position": [0.4, 0, 0.5], "orientation": UPRIGHT}]
+    tilt = {"orientation": [1, 0, 0, 0], "absolute_z_axis_tolerance": 3.2}
+    tilts = [
+        tilt
+        | {"link_name": link}
+        | {f"absolute_{axis}_axis_tolerance": limit for axis in "xy"}
+        for link, limit in ((HAND, 0.5), (HAND, 0.2), ("panda_link7", 0.4))
+    ]
+    places = [
+        {"link_name": link, "constraint_region": region}
+        for link in (HAND, "panda_link7")
+    ]
+    constraints = {"orientation_constraints": tilts, "position_constraints": places}
+    content = request(path_constraints=constraints)
+    scene = scene_of(tmp_path, content)
+    placed = placed_scene(scene, robot, scene.start_q)
+    problem, _, _ = requested_problem(cnpgen.load_problem("panda"), robot, [placed])
+    record = record_problem(as_problem(record_problem(problem)))
+    stored = [each for each in as_problem(record).constraint if hasattr(each, "link")]
+    assert stored == list(placed.request.constraints)
+    links = [HAND, HAND, "panda_link7", HAND, "panda_link7"]
+    assert [each.link for each in stored] == links

@@ -9,10 +9,10 @@ import pytest
 
 import cnpgen
 from cnpgen.problems.load_robot import load_robot
-from cnpgen.refine.solver.hulls import Hulls
 from cnpgen.robots.solid import place_obstacles
 from cnpgen.scenes import load_scenes, solve_scenes
 from tests.conftest import needs_compiler
+from tests.examples.coal_hulls import CoalHulls
 from tests.examples.example_robots import needs_robots
 
 pytestmark = needs_robots
@@ -38,7 +38,7 @@ bookshelf_small_panda:
 def penetration(name: str, scene: cnpgen.scenes.SceneProblem) -> float:
     """Return the largest penetration of the links at the goal by Coal [m]."""
     problem = cnpgen.load_problem(name).with_obstacles(scene.obstacles)
-    return Hulls(problem, load_robot(problem)).violation(
+    return CoalHulls(problem, load_robot(problem)).violation(
         scene.goal_q.T.copy(), place_obstacles(scene.obstacles)
     )
 

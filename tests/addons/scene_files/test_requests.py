@@ -22,6 +22,8 @@ from cnpgen.problems.scenes.scene_problem import SceneProblem
 from cnpgen.robots.robot import Robot
 from cnpgen.robots.shape.convex_part import turned
 from cnpgen.scenes import SceneError, load_scenes, save_scenes, solve_scenes
+from tests.addons.scene_files.moveit_messages import document
+from tests.addons.scene_files.test_moveit_unused import OTHER, changed
 from tests.conftest import needs_compiler
 from tests.examples.example_robots import needs_robots
 
@@ -31,6 +33,7 @@ JOINTS = [f"panda_joint{index}" for index in range(1, 8)]
 START = [-0.5, -0.4, 0, -2.2, 0, 1.8, 0.785]
 GOAL = [0.5, -0.4, 0, -2.2, 0, 1.8, 0.785]
 UPRIGHT = [0, 0, 0, 1]
+BASE, HAND = "panda_link0", "panda_hand"
 
 
 def box(name: str, size: list[float], at: list[float], frame: str) -> dict[str, Any]:
@@ -451,9 +454,168 @@ def test_allowed_pairs_of_attached_objects_and_links_are_touch_links(tmp_path):
     scene = scene_of(tmp_path, content | {"allowed_collision_matrix": matrix(*allowed)})
     fingers = "panda_leftfinger", "panda_rightfinger"
     assert scene.request.attached[0].touch_links == (*fingers, "panda_link5")
-    for pair in (("post", "panda_link5"), ("stick", "post")):
-        with pytest.raises(SceneError, match=f"is '{' and '.join(sorted(pair))}'"):
-            scene_of(tmp_path, content | {"allowed_collision_matrix": matrix(pair)})
+    allowed = ("post", "panda_link5"), ("stick", "post"), ("panda_link0", "shelf")
+    scene = scene_of(tmp_path, content | {"allowed_collision_matrix": matrix(*allowed)})
+    links = scene.request.obstacle_touch_links
+    touching = dict(zip(("post", "shelf"), links, strict=True))
+    assert touching == {"post": ("panda_link5", "stick"), "shelf": ("panda_link0",)}
+
+
+def test_defaults_of_allowed_collisions(tmp_path, robot):
+    shelf = box("shelf", [0.1, 0.1, 0.1], [0.8, 0, 0.2], "panda_link0")
+    world = {"collision_objects": [*request()["world"]["collision_objects"], shelf]}
+
+    def read(names: list[str], values: list[bool], **entries: Any) -> SceneProblem:
+        defaults = {"default_entry_names": names, "default_entry_values": values}
+        acm = {"allowed_collision_matrix": defaults | entries}
+        return scene_of(tmp_path, request(start_state=stick(), world=world) | acm)
+
+    assert [each.name for each in read(["post"], [True]).obstacles] == ["shelf"]
+    scene = read(["panda_link5"], [True])
+    assert scene.request.obstacle_touch_links == (("panda_link5",),) * 2
+    assert "panda_link5" in scene.request.attached[0].touch_links
+    assert not read(["post"], [False]).request.obstacle_touch_links
+    for names, values, entries, text in (
+        (["stick"], [True], {}, "stick and all others"),
+        (["post", "shelf"], [True, False], {}, "true for post and false for shelf"),
+        (["post"], [True], matrix(), "true for post and false for it and panda_link0"),
+    ):
+        with pytest.raises(SceneError, match=f"matrix is '{text}"):
+            read(names, values, **entries)
+    with pytest.raises(SceneError, match="names the link 'panda_link_5', which the"):
+        placed(read(["panda_link_5"], [True]), robot)
+
+
+def test_an_object_that_links_may_touch_becomes_a_link_of_the_base(tmp_path, robot):
+    pairs = ("post", "panda_link5"), ("shelf", "panda_link0"), ("post", "stick")
+    shelf = box("shelf", [0.1, 0.1, 0.1], [0.8, 0, 0.2], "panda_link0")
+    world = {"collision_objects": [*request()["world"]["collision_objects"], shelf]}
+    content = request(start_state=stick(), world=world)
+    content |= {"allowed_collision_matrix": matrix(*pairs)}
+    scene = placed(scene_of(tmp_path, content), robot)
+    assert [each.name for each in scene.obstacles] == ["shelf"]
+    _, other, _ = requested_problem(robot_problem(), robot, [scene])
+    assert other.shape is not None
+    assert other.shape.joints["attached post"] == 0
+    left_out = {
+        frozenset((each.first, each.second))
+        for each in other.shape.pairs
+        if each.left_out == "disabled"
+    }
+    of_post = {frozenset(("attached post", "panda_link5"))}
+    of_post |= {frozenset(("attached post", "attached stick"))}
+    assert {pair for pair in left_out if "attached post" in pair} == of_post
+    part = next(
+        each for each in other.shape.convex_parts if each.link == "attached post"
+    )
+    corners = [[0.475, -0.025, 0], [0.525, 0.025, 0.3]]
+    np.testing.assert_allclose(
+        [part.vertices.min(axis=0), part.vertices.max(axis=0)], corners, atol=1e-9
+    )
+    with pytest.raises(SceneError, match="attached objects, allowed collisions"):
+        scene_plans(robot_problem(), [scene_of(tmp_path, content)])
+    with pytest.raises(SceneError, match="are not written"):
+        save_scenes(tmp_path / "other", [scene_of(tmp_path, content)])
+
+
+def test_padding_and_scale_enlarge_links_for_obstacles_only(tmp_path, robot):
+    sizes = {
+        "link_padding": [{"link_name": "panda_hand", "padding": 0.02}],
+        "link_scale": [
+            {"link_name": "panda_hand", "scale": 1.5},
+            {"link_name": "panda_link0", "scale": 1},
+        ],
+    }
+    content = request(start_state=stick(), **sizes)
+    content |= {"allowed_collision_matrix": matrix(("post", "panda_link5"))}
+    scene = placed(scene_of(tmp_path, content), robot)
+    assert scene.request.link_sizes == (("panda_hand", 1.5, 0.02),)
+    _, other, _ = requested_problem(robot_problem(), robot, [scene])
+    assert other.shape is not None
+    corners = {part.link: part.vertices for part in other.shape.convex_parts}
+    hand = corners["panda_hand"]
+    offsets = hand - hand.mean(axis=0)
+    lengths = np.linalg.norm(offsets, axis=1, keepdims=True)
+    grown = hand.mean(axis=0) + offsets * (1.5 + 0.02 / lengths)
+    name = "attached padding of panda_hand"
+    np.testing.assert_allclose(corners[name], grown, atol=1e-9)
+    assert not {part.link for part in other.shape.convex_parts} & {
+        "attached padding of panda_link0"
+    }
+    (body,) = (each for each in corners if each.endswith("of attached stick"))
+    # In the frame of the joint, which is turned by 45 degrees about z.
+    width = np.sqrt(2) * (1.5 * 0.04 + 0.04)
+    sizes_of_stick = np.ptp(corners[body], axis=0)
+    assert sizes_of_stick == pytest.approx([width, width, 1.5 * 0.3 + 0.04])
+    checked = {
+        frozenset((each.first, each.second))
+        for each in other.shape.pairs
+        if not each.left_out
+    }
+    post = "attached post"  # which no padded link may enter
+    assert {pair for pair in checked if {name, body} & pair} == {
+        frozenset((name, post)),
+        frozenset((body, post)),
+    }
+    sizes = {"link_padding": [{"link_name": "hnd", "padding": 0.02}]}
+    unknown = scene_of(tmp_path, request(**sizes))
+    with pytest.raises(SceneError, match="a padding or scale names the link 'hnd'"):
+        placed(unknown, robot)
+
+
+@pytest.mark.slow
+@needs_compiler
+def test_a_padded_link_keeps_its_distance_from_obstacles(tmp_path, robot):
+    corners = next(
+        part.vertices for part in robot.shape.convex_parts if part.link == "panda_hand"
+    )
+    frame = robot.model.frames[robot.model.getFrameId("panda_hand")]
+    data = robot.model.createData()
+    pin.forwardKinematics(robot.model, data, np.array(START))
+    pose = data.oMi[frame.parentJoint]
+    corners = corners @ pose.rotation.T + pose.translation
+    corner, center = corners[corners[:, 0].argmax()], corners.mean(axis=0)
+    ahead = corner + 0.05 * (corner - center) / np.linalg.norm(corner - center)
+    block = box("block", [0.02] * 3, ahead.tolist(), "world")
+
+    def solved(padding: float) -> Any:
+        pads = [{"link_name": "panda_hand", "padding": padding}]
+        world = {"collision_objects": [block]}
+        content = request(world=world, link_padding=pads)
+        return solve_scenes("panda", [scene_of(tmp_path, content)])
+
+    assert solved(0.03).valid.all()
+    refused = solved(0.06)
+    assert not refused.valid.any()
+    (failure,) = refused.summary()["not_valid"]
+    assert "padding of panda_hand, block" in failure["explanation"]
+
+
+@pytest.mark.slow
+@needs_compiler
+def test_an_allowed_collision_of_an_object_and_links_holds_for_these_links(
+    tmp_path, robot
+):
+    at = pose_of(robot, "panda_hand", START).translation.tolist()
+    block = box("block", [0.1, 0.1, 0.1], at, "panda_link0")
+    hand = ["panda_link6", "panda_link7", "panda_hand"]
+    names = ["block", *hand, "panda_leftfinger", "panda_rightfinger"]
+    world = {"collision_objects": [*request()["world"]["collision_objects"], block]}
+
+    def solved(links: list[str]) -> Any:
+        rows = [[{a, b} - {*links} == {"block"} for b in names] for a in names]
+        acm = {"entry_names": names, "entry_values": rows}
+        content = request(world=world, allowed_collision_matrix=acm)
+        return solve_scenes("panda", [scene_of(tmp_path, content)])
+
+    allowed = solved(names[1:])
+    assert allowed.valid.all()
+    pairs = open_problem(allowed.plans.problem)[1].shape.pairs
+    assert any(each.left_out == "disabled" for each in pairs)
+    refused = solved(hand[:2])
+    assert not refused.valid.any()
+    (failure,) = refused.summary()["not_valid"]
+    assert "panda_hand, attached block" in failure["explanation"]
 
 
 @pytest.mark.slow
@@ -556,3 +718,41 @@ def test_plans_record_the_elements_that_were_accepted_as_unused(tmp_path):
         plans.source
         == f"scenes of {tmp_path / 'case.yaml'}, without max_cartesian_speed"
     )
+
+
+def document_for_panda() -> dict[str, Any]:
+    """Return the document of all elements of the messages for a Panda among far objects."""
+    text = json.dumps(document())
+    for old, new in (("hand", HAND), ("finger", "panda_leftfinger"), ("base", BASE)):
+        text = text.replace(f'"{old}"', f'"{new}"')
+    content: dict[str, Any] = json.loads(text)
+    for state in (content["robot_state"], content["start_state"]):
+        state["joint_state"] |= {"name": JOINTS, "position": START, "velocity": []}
+    content["robot_state"].pop("attached_collision_objects")
+    content["world"]["collision_objects"] = content["world"]["collision_objects"][:1]
+    content["fixed_frame_transforms"][0]["transform"]["translation"]["x"] = 3
+    constraints = request()["goal_constraints"][0]["joint_constraints"]
+    content["goal_constraints"][0]["joint_constraints"] = constraints
+    names = content["allowed_collision_matrix"]["entry_names"]
+    assert set(names) <= {HAND, "panda_leftfinger"}
+    return content
+
+
+@pytest.mark.slow
+@needs_compiler
+def test_elements_that_are_not_used_do_not_change_plans_and_verdicts(tmp_path):
+    usual = other = document_for_panda()
+    for place, value in OTHER.values():
+        other = changed(other, place, value)
+    found = []
+    for content in (usual, other):
+        solved = solve_scenes("panda", [scene_of(tmp_path, content)])
+        assert solved.valid.all()
+        plans = solved.plans
+        verdicts = cnpgen.evaluate_plans(plans)
+        points = plans.path_control_points, plans.rate_control_points
+        arrays = *points, plans.columns["obstacle_poses"]
+        bytes_of = [array.tobytes() for array in arrays]
+        report = [verdict.to_dict() for verdict in verdicts.verdicts]
+        found.append((bytes_of, plans.problem, verdicts.summary(), report))
+    assert found[0] == found[1]

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from cnpgen.addons.trajectories import text_tables, trajectory_tables
+from cnpgen.addons.trajectories import parquet_tables, text_tables, trajectory_tables
 from cnpgen.addons.trajectories.trajectory_tables import read_trajectory_tables
 from cnpgen.errors import UsageError
 
@@ -58,7 +58,7 @@ def test_values_and_bytes_of_parquet_are_counted(
 ) -> None:
     path = write_parquet(tmp_path / "a.parquet", t=np.zeros(1000), q=np.zeros(1000))
     read_trajectory_tables(path)
-    monkeypatch.setattr(trajectory_tables, name, limit)
+    monkeypatch.setattr(parquet_tables, name, limit)
     with pytest.raises(UsageError, match=r"holds 2,000 values in [\d,]+ bytes"):
         read_trajectory_tables(path)
 

@@ -263,7 +263,10 @@ def test_exported_plans_are_read_as_they_are(
     ):
         assert np.allclose(trajectory.t, expected.t, atol=1e-9, rtol=0)
         for name in ("q", "dq", "ddq"):
-            assert np.array_equal(getattr(trajectory, name), getattr(expected, name))
+            found, wanted = getattr(trajectory, name), getattr(expected, name)
+            if to == "joint-trajectory":  # the last time is that of a nanosecond
+                found, wanted = found[:-1], wanted[:-1]
+            assert np.array_equal(found, wanted)
         if to != "joint-trajectory":
             np.testing.assert_array_equal(
                 trajectory.phase, plans.motion[[0]].phase_at(expected.t[None])[0]
@@ -518,7 +521,11 @@ def test_the_command_judges_exported_plans(
     assert main(words) == 1
     out = capsys.readouterr().out
     assert "undecided: joint acceleration: the curve lacks a derivative" in out
-    cells = r" +joint velocity +-?\d\.\d\de[+-]\d\d +\d\.\de-\d\d +rad/s +0 +\d\.\d{4}  joint_\d"
+    number = r"\d\.\d\de[+-]\d\d"
+    either = f"({number} +-|- +{number})"  # margin or violation
+    cells = (
+        f" +joint velocity +{either}" + r" +\d\.\de-\d\d +rad/s +0 +\d\.\d{4}  joint_\d"
+    )
     assert any(
         re.fullmatch(cells, line) for line in out.splitlines()
     )  # one line per condition, with its unit

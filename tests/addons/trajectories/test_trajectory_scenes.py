@@ -130,6 +130,40 @@ def test_a_dataset_of_lerobot_has_its_scenes(lines: Plans, tmp_path: Path) -> No
         load_trajectories(tmp_path / "le", lines.problem, scenes=[scene(1.0)])
 
 
+def test_export_takes_scenes_for_plans_without(
+    lines: Plans,
+    files: tuple[Path, Path],
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    pytest.importorskip("pyarrow")
+    alone = cnpgen.make_plans(
+        "panda-3kg",
+        lines.boundary,
+        path_control_points=lines.path_control_points,
+        rate_control_points=lines.rate_control_points,
+    )
+    cnpgen.save_plans(tmp_path / "alone.h5", alone)
+    words = ["export", str(tmp_path / "alone.h5"), "--rate", "100", "--to"]
+    scenes = ["--scenes", str(files[1])]
+    assert main([*words, "lerobot", *scenes, "-o", str(tmp_path / "le")]) == 0
+    loaded = load_trajectories(tmp_path / "le", lines.problem)
+    found = cnpgen.evaluate_trajectories(loaded.problem, loaded.trajectories)
+    decisions = [v.conditions["robot clearance"].decision for v in found.verdicts]
+    assert decisions == ["invalid", "valid"]
+    capsys.readouterr()
+    for to, other, text in (
+        ("csv", scenes, "csv stores no obstacles, expected lerobot"),
+        ("lerobot", [*scenes, "--join", str(files[1])], "plans without --join"),
+    ):
+        assert main([*words, to, *other, "-o", str(tmp_path / "no")]) == 2
+        assert text in capsys.readouterr().err
+    given = ["export", str(files[1]), "--to", "lerobot", *scenes]
+    assert main([*given, "-o", str(tmp_path / "no")]) == 2
+    assert "have scenes of their own" in capsys.readouterr().err
+    assert not (tmp_path / "no").exists()
+
+
 def test_scenes_of_other_obstacles_and_plans_without_scenes_are_refused(
     files: tuple[Path, Path], tmp_path: Path
 ) -> None:

@@ -686,6 +686,27 @@ def test_a_browser_shows_the_verdict_without_an_error(rejected, width):
     assert reddish.mean() > 0.003  # the badge and the violated conditions
 
 
+def test_conditions_that_samples_do_not_determine_have_no_number(tmp_path):
+    path = tmp_path / "a.csv"
+    t = np.arange(0, 0.6001, 0.01)
+    q = np.tile([-0.3, 0.6975, 0, -0.5049, 0, 1.9286], (len(t), 1))
+    x = t / 0.6
+    q[:, 0] += 0.3 * (10 * x**3 - 15 * x**4 + 6 * x**5)
+    head = "t,q1,q2,q3,q4,q5,q6"
+    table = np.column_stack([t, q])
+    np.savetxt(path, table, delimiter=",", header=head, comments="", fmt="%.17g")
+    out = tmp_path / "a.html"
+    assert main(["view", str(path), "--problem", "airhockey", "-o", str(out)]) == 0
+    page = in_page(out.read_text(encoding="utf-8"), 0)
+    texts = {cause["name"]: cause["text"] for cause in page["verdict"]["causes"]}
+    unknown = [name for name, text in texts.items() if text.startswith("not measured")]
+    assert [name.rpartition(" ")[0] for name in sorted(unknown)] == [
+        "joint acceleration",
+        "joint torque",
+    ]
+    assert not any("e+0" in text for text in texts.values())
+
+
 @needs_meshcat
 def test_sampled_trajectories_are_shown_with_their_verdicts(tmp_path, capsys):
     hit = load("hit")

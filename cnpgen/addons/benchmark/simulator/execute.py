@@ -18,6 +18,7 @@ from cnpgen.addons.benchmark.simulator.executed import (
 )
 from cnpgen.addons.benchmark.simulator.plant import (
     Plant,
+    known_friction,
     rated_torque,
     rotor_inertia,
 )
@@ -42,15 +43,15 @@ class Controller:
 
     w is ``GAIN_RAD_S``. If a torque would exceed its limit, the acceleration is scaled
     down in its direction, and the holding torque keeps priority. The robot is nominal,
-    with the rotors of its drives but without friction: of a plant, only the delay
-    counts. ``limit`` has the rated torques [N m], shape
-    (n,).
+    with the rotors of its drives and their friction in the direction of the plan: of a
+    plant, only the delay counts. ``limit`` has the rated torques [N m], shape (n,).
     """
 
     def __init__(self, problem: Problem, robot: Robot, plant: Plant) -> None:
         self._model = robot.model.copy()
         self._model.armature = rotor_inertia(robot)
         self._data = self._model.createData()
+        self._robot = robot
         self.limit = rated_torque(problem, robot)
         self._delay = plant.delay
         self._delayed: deque[Array] = deque()
@@ -66,13 +67,16 @@ class Controller:
             + GAIN_RAD_S**2 * (desired[0] - q)
             + 2 * GAIN_RAD_S * (desired[1] - dq)
         )
+        friction = known_friction(self._robot, desired[1])
         holding_torque = np.clip(
-            pin.rnea(self._model, self._data, q, dq, np.zeros_like(q)),
+            pin.rnea(self._model, self._data, q, dq, np.zeros_like(q)) + friction,
             -self.limit,
             self.limit,
         )
         acceleration_torque = (
-            pin.rnea(self._model, self._data, q, dq, acceleration) - holding_torque
+            pin.rnea(self._model, self._data, q, dq, acceleration)
+            + friction
+            - holding_torque
         )
         with np.errstate(divide="ignore", invalid="ignore"):
             scale = np.nanmin(

@@ -5,7 +5,7 @@ Dry and viscous friction of the iiwa's joints are those of the Air Hockey Challe
 joints is a fraction of their rated torque.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -14,6 +14,7 @@ from cnpgen.arrays import Array
 from cnpgen.errors import UsageError, nearest
 from cnpgen.problems.problem import Problem
 from cnpgen.robots.robot import Robot
+from cnpgen.world.drive import friction_bounds
 
 
 class Friction(NamedTuple):
@@ -59,7 +60,7 @@ class Plant:
 PLANTS = {
     plant.name: plant
     for plant in (
-        Plant("nominal", "friction and damping that the controller does not model"),
+        Plant("nominal", "friction and damping; the controller knows those of [drive]"),
         Plant("heavier", "the same with 10 % more mass and inertia", mass=1.1),
         Plant("delayed", "the same with torques that take effect 1 ms late", delay=1),
     )
@@ -105,3 +106,12 @@ def rated_torque(problem: Problem, robot: Robot) -> Array:
 def rotor_inertia(robot: Robot) -> Array:
     """Return the inertias of the rotors seen at the joints [kg m^2], shape (n,); zero without drives."""
     return np.zeros(robot.n) if robot.drive is None else robot.drive.armature
+
+
+def known_friction(robot: Robot, dq: Array) -> Array:
+    """Return the friction of the drives at velocities [N m], shape (n,); zero without drives and at rest."""
+    if robot.drive is None:
+        return np.zeros(robot.n)
+    # Both bounds of friction that is certain are its value, but for a reversal.
+    certain = replace(robot.drive, friction_help=1.0)
+    return np.asarray(np.mean(friction_bounds(certain, dq), axis=0))

@@ -18,7 +18,7 @@ from cnpgen.addons.benchmark.simulator.reference import TICK_S
 from cnpgen.errors import MachineError, MissingExtraError, requires_extra
 from cnpgen.store.files.atomic import machine_error, machine_errors
 
-IMAGE_WIDTH, IMAGE_HEIGHT = 640, 480
+IMAGE_WIDTH, IMAGE_HEIGHT = 800, 600
 FILM_FRAMES_PER_S = 25
 SLOW_MOTION_FACTOR = 4
 FILM_TAIL_S = 1.0  # shown after the plan

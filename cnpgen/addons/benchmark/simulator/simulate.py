@@ -93,7 +93,7 @@ def simulate_plans(
     workers: int | None = None,
     progress: Callable[[int], None] | None = None,
 ) -> Simulation:
-    """Execute plans in MuJoCo: computed torque at 1 kHz on a robot with friction that its controller does not model.
+    """Execute plans in MuJoCo: computed torque at 1 kHz on a robot with friction; its controller knows that of drives.
 
     On a table, a plan that ends in motion is a hit, and the puck lies 7 cm ahead of its
     end. Plans are executed independently of each other and of the number of processes.

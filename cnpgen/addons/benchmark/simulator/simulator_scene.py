@@ -104,19 +104,28 @@ class SimulatorScene:
         return np.asarray((positions - self.table_position) @ self.table_rotation)
 
 
+_SKY_AND_FLOOR = (
+    '<texture type="skybox" builtin="gradient" rgb1="0.97 0.98 1" rgb2="0.72 0.8 0.9"'
+    ' width="64" height="384"/>'
+    '<texture name="floor" type="2d" builtin="checker" rgb1="0.87 0.88 0.9"'
+    ' rgb2="0.82 0.83 0.86" width="256" height="256"/>'
+    '<material name="floor" texture="floor" texrepeat="16 16"/>'
+)
+
+
 def scene_xml(scene: SimulatorScene) -> str:
     """Write the scene as MJCF."""
     gravity = _numbers(scene.robot.chain.gravity)
     return f"""<mujoco model="{scene.problem.name}">
 <compiler angle="radian" autolimits="true"/>
 <option timestep="{SIMULATION_STEP_S}" gravity="{gravity}" integrator="implicitfast" cone="elliptic"/>
-<visual><global offwidth="1280" offheight="960"/><quality shadowsize="1024"/>
-<headlight ambient="0.4 0.4 0.4" diffuse="0.5 0.5 0.5"/></visual>
+<visual><global offwidth="1280" offheight="960"/><quality shadowsize="4096"/><map shadowclip="3"/>
+<headlight ambient="0.45 0.45 0.45" diffuse="0.35 0.35 0.35"/></visual>
 <default><geom contype="0" conaffinity="0" mass="0"/></default>
-<asset>{"".join(_meshes(scene))}</asset>
+<asset>{_SKY_AND_FLOOR}{"".join(_meshes(scene))}</asset>
 <worldbody>
-<light pos="0 0 4" dir="0 0 -1" diffuse="0.4 0.4 0.4"/>
-<geom type="plane" pos="0 0 -0.5" size="4 4 0.1" rgba="0.9 0.9 0.92 1"/>
+<light directional="true" pos="1 1 4" dir="-0.25 -0.3 -1" diffuse="0.45 0.45 0.45"/>
+<geom type="plane" pos="0 0 -0.5" size="8 8 0.1" material="floor"/>
 <geom type="cylinder" fromto="0 0 -0.5 0 0 0.1" size="0.1" rgba="0.4 0.4 0.4 1"/>
 {"".join(_arm(scene))}
 {"".join(_environment(scene))}

@@ -55,7 +55,7 @@ static double scale_at(NAME_memory *memory, int k) {
   residuals_at(memory, k, 0, memory->residuals[2]);
   for (int row = 0; row < RESIDUALS; row++, fast += LANES, slow += LANES, still += LANES) {
     double low = residual_lower[row], high = residual_upper[row], exceeds[LANES], any = 0;
-    for (int l = 0; l < LANES; l++) exceeds[l] = (fast[l] > high) | (fast[l] < low) ? 1.0 : 0.0;
+    for (int l = 0; l < LANES; l++) exceeds[l] = ((fast[l] > high) | (fast[l] < low)) ? 1.0 : 0.0;
     for (int l = 0; l < LANES; l++) any += exceeds[l];
     if (!(any > 0)) continue;
     for (int l = 0; l < LANES; l++) {

@@ -1,4 +1,4 @@
-"""Drives in the simulation: rotors and friction in the plant, rotors in the controller; baselines refuse by name."""
+"""Drives in the simulation: rotors and friction in the plant and the controller; baselines refuse by name."""
 
 import numpy as np
 import pinocchio as pin
@@ -74,6 +74,22 @@ def test_the_controller_accelerates_the_rotors() -> None:
     torque = control(q, dq, (q, dq, ddq))
     rigid = pin.rnea(ROBOTS[NAME].model, data, q, dq, ddq)
     np.testing.assert_allclose(torque, rigid + drive.armature * ddq, atol=1e-9)
+
+
+def test_the_controller_adds_the_friction_of_the_drives_in_the_direction_of_the_plan() -> (
+    None
+):
+    control, drive = (
+        Controller(PROBLEMS[NAME], ROBOTS[NAME], PLANTS["nominal"]),
+        ROBOTS[NAME].drive,
+    )
+    assert drive is not None
+    q, zero = ROBOTS[NAME].home, np.zeros(ROBOTS[NAME].n)
+    dq = np.array([0.2, -0.2, 0.3, -0.3, 0.1, -0.1, 0.2])  # beyond the reversal speed
+    torque = control(q, dq, (q, dq, zero))
+    rigid = pin.rnea(ROBOTS[NAME].model, ROBOTS[NAME].model.createData(), q, dq, zero)
+    friction = drive.viscous * dq + drive.coulomb * np.sign(dq)
+    np.testing.assert_allclose(torque, rigid + friction, atol=1e-9)
 
 
 def test_parts_without_drives_refuse_by_name() -> None:

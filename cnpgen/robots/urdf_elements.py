@@ -1,15 +1,21 @@
-"""Elements and attributes of a URDF that are not read: those of other software in one line, others one by one."""
+"""Elements and attributes of a URDF that are not read: misspelt ones, others, and those of other software."""
 
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
+from pathlib import Path
 from xml.etree.ElementTree import Element
 
-from cnpgen.errors import counted, listed, nearest
+from cnpgen.errors import RecipeError, counted, listed, nearest
+from cnpgen.store.files.accounted import MISSPELT
 
+_TOP = ("link", "joint")
+# Of which an element has several.
+_REPEATED = {*_TOP, "collision", "visual", "disable_collisions"}
 # tag -> its attributes and children that are read or change nothing (name, color)
 _KNOWN: dict[str, tuple[str, ...]] = {
+    "robot": ("name", "version", *_TOP),
     "link": ("name", "inertial", "collision", "visual"),
     "joint": (
         *("name", "type", "parent", "child", "origin", "axis", "limit", "dynamics"),
@@ -43,31 +49,43 @@ MAX_LISTED_TAGS = 10
 
 def unread_elements(tree: Element) -> Iterator[str]:
     """Yield sentences about the elements and attributes of a URDF that have no effect."""
-    counts = Counter(
-        each.tag for each in tree if each.tag not in {"link", "joint", *_OPAQUE}
-    )
+    counts = Counter(each.tag for each in tree if each.tag not in {*_TOP, *_OPAQUE})
     if counts:
         texts = [f"<{tag}> ({count})" for tag, count in sorted(counts.items())]
         yield f"elements of other software are not read: {listed(texts, MAX_LISTED_TAGS)}"
-    unknown = Counter[str]()
-    for element in tree:
-        if element.tag in {"link", "joint"}:
-            unknown.update(_unknown(element))
+    unknown = Counter(text for part in tree for text, *_ in _unknown(part))
     for text, count in sorted(unknown.items()):
         yield f"{text} is not read, {counted(count, 'time')}"
 
 
-def _unknown(element: Element) -> Iterator[str]:
-    """Yield the unknown parts of an element and of those in it, with the nearest known name."""
-    known = _KNOWN.get(element.tag)
+def check_elements(
+    tree: Element, path: Path, known: Mapping[str, tuple[str, ...]] = _KNOWN
+) -> None:
+    """Raise RecipeError for parts of a file whose names are near one that is read, may occur beside them, and does not."""
+    hints = {
+        text: nearest(name.lower(), names, similarity=MISSPELT)
+        for text, name, names in _unknown(tree, known)
+    }
+    if parts := [f"{text}{hint}" for text, hint in hints.items() if hint]:
+        named = listed(parts, MAX_LISTED_TAGS)
+        raise RecipeError([f"{path}: {named} would not be read: rename or remove it"])
+
+
+def _unknown(
+    element: Element, table: Mapping[str, tuple[str, ...]] = _KNOWN
+) -> Iterator[tuple[str, str, tuple[str, ...]]]:
+    """Yield the unknown parts of an element and of those in it: a text, the name, and the names that it may mean."""
+    known = table.get(element.tag)
     if known is None:
         return
+    present = {*element.attrib, *(child.tag for child in element)} - _REPEATED
+    missing = tuple(name for name in known if name not in present)
     for key in element.attrib:
         # attributes with a name space are those of other software
         if key not in known and not key.startswith("{"):
-            yield f"the attribute {key!r} of <{element.tag}>{nearest(key, known)}"
+            yield f"the attribute {key!r} of <{element.tag}>", key, missing
     for child in element:
         if child.tag not in known and child.tag not in _OPAQUE:
-            yield f"<{child.tag}> in <{element.tag}>{nearest(child.tag, known)}"
+            yield f"<{child.tag}> in <{element.tag}>", child.tag, missing
         else:
-            yield from _unknown(child)
+            yield from _unknown(child, table)

@@ -1,0 +1,131 @@
+"""Episodes of a LeRobotDataset v3 as tables."""
+
+import re
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from cnpgen.addons.trajectories.message_tables import MESSAGE_TIME
+from cnpgen.addons.trajectories.parquet_tables import number_column, read_parquet
+from cnpgen.addons.trajectories.trajectory_table import (
+    MAX_RATE_DEVIATION,
+    TrajectoryTable,
+    Values,
+)
+from cnpgen.errors import UsageError
+from cnpgen.robots.parameter_ranges import PARAMETER_UNITS
+from cnpgen.store.files.atomic import read_file
+from cnpgen.store.files.documents import parse_json
+from cnpgen.store.files.size_limits import MAX_TABLE_BYTES
+from cnpgen.store.scene_table import OBSTACLE_POSES
+
+MAX_FEATURE_WIDTH = 10_000  # values of a feature of LeRobot
+LEROBOT_INFO = "meta/info.json"  # in a folder of LeRobot
+LEROBOT_ENVIRONMENT = "observation.environment_state"
+_INDICES = (
+    "timestamp",
+    "frame_index",
+    "episode_index",
+    "index",
+    "task_index",
+)
+_POSE_NAME = re.compile(rf"{OBSTACLE_POSES}(_[0-9]+)?")  # a value of LeRobot
+
+
+def read_lerobot(folder: Path) -> Iterator[TrajectoryTable]:
+    """Yield the episodes of a LeRobotDataset v3: states, or actions without them, with their names."""
+    try:
+        info = parse_json(
+            read_file(folder / LEROBOT_INFO, max_bytes=MAX_TABLE_BYTES).decode()
+        )
+        features, version = info["features"], str(info["codebase_version"])
+        key = next(key for key in ("observation.state", "action") if key in features)
+        names = _feature_names(features[key])
+        described = (
+            _feature_names(features[LEROBOT_ENVIRONMENT])
+            if LEROBOT_ENVIRONMENT in features
+            else []
+        )
+    except (ValueError, KeyError, TypeError, IndexError, StopIteration) as error:
+        raise UsageError(
+            f"{folder / LEROBOT_INFO} does not describe a dataset of LeRobot: {error!r:.200}"
+        ) from error
+    if not version.startswith("v3"):
+        raise UsageError(
+            f"{folder} has LeRobot's format {version}, expected v3.0: convert it with LeRobot"
+        )
+    parameters = {
+        name: k for k, name in enumerate(described) if name in PARAMETER_UNITS
+    }
+    scene = [k for k, name in enumerate(described) if _POSE_NAME.fullmatch(name)]
+    read = {key, *_INDICES, *([LEROBOT_ENVIRONMENT] if described else [])}
+    unused = [name for name in features if name not in read]
+    unused += [
+        f"{LEROBOT_ENVIRONMENT} {name}"
+        for k, name in enumerate(described)
+        if name not in parameters and k not in scene
+    ]
+    environment_key = [LEROBOT_ENVIRONMENT] if parameters or scene else []
+    for path in sorted(folder.glob("data/*/*.parquet")):
+        table = read_parquet(path)
+        needed = (
+            "timestamp",
+            "episode_index",
+            key,
+            *environment_key,
+        )
+        missing = [name for name in needed if name not in table.column_names]
+        if missing:
+            raise UsageError(
+                f"{path}: there is no column {missing[0]!r}, only {', '.join(table.column_names)}"
+            )
+        widths = 1, 1, len(names), *([len(described)] if environment_key else [])
+        columns_of = zip(needed, widths, strict=True)
+        times, episodes, values, *environment = (
+            number_column(table, name, path, width) for name, width in columns_of
+        )
+        for episode in dict.fromkeys(episodes[:, 0].tolist()):
+            rows = episodes[:, 0] == episode
+            columns: dict[str, Values] = {MESSAGE_TIME: times[rows, 0]}
+            columns |= {name: values[rows, k] for k, name in enumerate(names)}
+            columns |= {name: environment[0][rows, k] for name, k in parameters.items()}
+            if scene:
+                columns[OBSTACLE_POSES] = environment[0][rows][:, scene]
+            place = f"{folder}: episode {episode:g}"
+            _check_rate(place, columns[MESSAGE_TIME], info.get("fps"))
+            yield TrajectoryTable(place, columns, unused=tuple(unused))
+
+
+def _check_rate(place: str, t: Values, rate: Any) -> None:
+    """Check that times agree with the frames per second that a dataset states."""
+    if not isinstance(rate, int | float) or not rate > 0:
+        raise UsageError(f"{place}: fps must be above 0, got {rate!r:.60}")
+    steps = np.diff(t)
+    if len(steps) and abs(float(np.median(steps)) * rate - 1) > MAX_RATE_DEVIATION:
+        step = float(np.median(steps))
+        raise UsageError(f"{place} has steps of {step:.3g} s, and its fps is {rate:g}")
+
+
+def _feature_names(feature: Any) -> list[str]:
+    """Return the names of a feature's values: a list, a list in an object, or indices.
+
+    Raises:
+        TypeError, KeyError, ValueError, IndexError: It is no feature.
+    """
+    width, names = (
+        int(feature["shape"][0]),
+        feature.get("names") if isinstance(feature, dict) else None,
+    )
+    if not 0 < width <= MAX_FEATURE_WIDTH:
+        raise ValueError(
+            f"a feature has {width} values, expected 1 to {MAX_FEATURE_WIDTH:,}"
+        )
+    if isinstance(names, dict):
+        names = next(
+            (entry for entry in names.values() if isinstance(entry, list)), None
+        )
+    if isinstance(names, list) and len(names) == width:
+        return [str(name) for name in names]
+    return [f"q{k}" for k in range(width)]

@@ -1,0 +1,255 @@
+"""Files with one element changed, dropped or misspelt: the difference is refused, listed, or changes the trajectory."""
+
+import copy
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+import pytest
+
+from cnpgen.errors import UsageError
+from cnpgen.trajectories import LoadOptions, load_trajectories
+from tests.addons.trajectories.test_table_columns import BACKWARDS, DQ, Q, T
+
+JOINTS = BACKWARDS[::-1]
+HEAD = ["t", *JOINTS, *(f"{joint}_velocity" for joint in JOINTS)]
+POINTS = [
+    {
+        "positions": q.tolist(),
+        "velocities": dq.tolist(),
+        "accelerations": [],
+        "effort": [],
+        "time_from_start": {"sec": 0, "nanosec": round(1e9 * t)},
+    }
+    for t, q, dq in zip(T, Q, DQ, strict=True)
+]
+HEADER = {"stamp": {"sec": 0, "nanosec": 0}, "frame_id": ""}
+MESSAGE = {"header": HEADER, "joint_names": JOINTS, "points": POINTS}
+RESULT = {
+    "planned_trajectory": {
+        "joint_trajectory": MESSAGE,
+        "multi_dof_joint_trajectory": {"joint_names": [], "points": []},
+    },
+    "trajectory_start": {
+        "joint_state": {"name": JOINTS, "position": Q[0].tolist()},
+        "attached_collision_objects": [],
+        "is_diff": False,
+    },
+    "error_code": {"val": 1, "message": "", "source": ""},
+    "planning_time": 0.1,
+}
+GOAL = {"goal": {"trajectory": MESSAGE}}
+STATES = [
+    {
+        "header": {"stamp": {"sec": 9, "nanosec": round(1e9 * t)}, "frame_id": ""},
+        "name": JOINTS,
+        "position": q.tolist(),
+        "velocity": dq.tolist(),
+        "effort": [],
+    }
+    for t, q, dq in zip(T, Q, DQ, strict=True)
+]
+COLUMNS = {"t": T.tolist(), "q": Q.tolist(), "joint_names": JOINTS}
+
+
+def outcome(unchanged: Path, changed: Path) -> str:
+    """Return how a changed file is read: "refused", "listed", "changed", or "silent"."""
+    before = load_trajectories(unchanged, "airhockey")
+    try:
+        after = load_trajectories(changed, "airhockey")
+    except UsageError:
+        return "refused"
+    if set(after.ignored) - set(before.ignored):
+        return "listed"
+    (a,), (b,) = before.trajectories, after.trajectories
+    same = [np.array_equal(a.t, b.t), np.array_equal(a.q, b.q)]
+    same.append((a.dq is None) == (b.dq is None))
+    same.append(a.dq is None or b.dq is None or np.array_equal(a.dq, b.dq))
+    return "silent" if all(same) else "changed"
+
+
+def rename(mapping: dict[str, Any], old: str, new: str) -> None:
+    mapping[new] = mapping.pop(old)
+
+
+def each(key: str, old: str, new: str) -> Callable[[Any], None]:
+    def change(document: Any) -> None:
+        for entry in document[key] if key else document:
+            rename(entry, old, new)
+
+    return change
+
+
+JSON_CHANGES: list[tuple[str, Any, Callable[[Any], Any], str]] = [
+    ("velocities", MESSAGE, each("points", "velocities", "velocites"), "refused"),
+    ("a key", MESSAGE, lambda m: m.update(velocity_scaling=0.5), "refused"),
+    (
+        "a stamp",
+        MESSAGE,
+        lambda m: rename(m["points"][5]["time_from_start"], "nanosec", "nanosecs"),
+        "refused",
+    ),
+    ("a time", MESSAGE, lambda m: m["points"][5].pop("time_from_start"), "refused"),
+    (
+        "one point",
+        MESSAGE,
+        lambda m: rename(m["points"][5], "positions", "q"),
+        "refused",
+    ),
+    ("order", MESSAGE, lambda m: m.update(joint_names=BACKWARDS), "changed"),
+    ("code", RESULT, lambda m: rename(m, "error_code", "eror_code"), "refused"),
+    ("failure", RESULT, lambda m: m["error_code"].update(val=-2), "refused"),
+    ("no value", RESULT, lambda m: m["error_code"].pop("val"), "refused"),
+    (
+        "attached",
+        RESULT,
+        lambda m: m["trajectory_start"]["attached_collision_objects"].append({"a": 1}),
+        "refused",
+    ),
+    (
+        "attached, misspelt",
+        RESULT,
+        lambda m: m["trajectory_start"].update(attached_objects=[{"a": 1}]),
+        "refused",
+    ),
+    (
+        "base",
+        RESULT,
+        lambda m: m["planned_trajectory"]["multi_dof_joint_trajectory"].update(
+            points=[{}]
+        ),
+        "refused",
+    ),
+    (
+        "base, misspelt",
+        RESULT,
+        lambda m: m["planned_trajectory"].update(multi_dof_joint={"points": [{}]}),
+        "refused",
+    ),
+    (
+        "tolerance",
+        GOAL,
+        lambda m: m["goal"].update(path_tolerance=[{"name": "a"}]),
+        "listed",
+    ),
+    ("scaling", GOAL, lambda m: m["goal"].update(speed=0.5), "refused"),
+    ("velocity", STATES, each("", "velocity", "velocty"), "refused"),
+    ("a position", STATES, lambda m: m[4].pop("position"), "refused"),
+    ("names", STATES, lambda m: [s.update(name=BACKWARDS) for s in m], "changed"),
+    ("a second", STATES, lambda m: m[4]["header"]["stamp"].update(sec=10), "refused"),
+    ("unit", COLUMNS, lambda m: m.update(unit="deg"), "listed"),
+    ("joint_names", COLUMNS, lambda m: rename(m, "joint_names", "joints"), "listed"),
+    ("an object", COLUMNS, lambda m: m.update(limits={"a": 1}), "refused"),
+]
+
+
+@pytest.mark.parametrize(
+    ("document", "change", "expected"),
+    [case[1:] for case in JSON_CHANGES],
+    ids=[case[0] for case in JSON_CHANGES],
+)
+def test_elements_of_messages(
+    tmp_path: Path, document: Any, change: Callable[[Any], Any], expected: str
+) -> None:
+    changed = copy.deepcopy(document)
+    change(changed)
+    paths = tmp_path / "a.json", tmp_path / "b.json"
+    for path, content in zip(paths, (document, changed), strict=True):
+        path.write_text(json.dumps(content))
+    assert outcome(*paths) == expected
+
+
+def test_the_loss_of_an_element_is_accepted_by_name(tmp_path: Path) -> None:
+    path = tmp_path / "a.json"
+    path.write_text(json.dumps(MESSAGE | {"velocity_scaling": 0.5}))
+    with pytest.raises(UsageError, match=r"velocity_scaling.*allow_unused"):
+        load_trajectories(path, "airhockey")
+    options = LoadOptions(allow_unused=("velocity_scaling",))
+    loaded = load_trajectories(path, "airhockey", options=options)
+    assert loaded.ignored == ("velocity_scaling",)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "expected"),
+    [
+        ("joint_3_velocity", "joint_3_velocty", "refused"),
+        ("joint_2", "jiont_2", "refused"),
+        ("t", "tme", "refused"),
+        ("t", "t [us]", "changed"),
+        ("joint_1", "joint_1 [deg]", "refused"),
+        ("joint_5", "joint_4", "refused"),
+    ],
+)
+def test_names_of_columns(tmp_path: Path, old: str, new: str, expected: str) -> None:
+    paths = tmp_path / "a.csv", tmp_path / "b.csv"
+    rows = np.column_stack([T, Q, DQ])
+    for path, name in zip(paths, (old, new), strict=True):
+        head = ",".join(name if each == old else each for each in HEAD)
+        np.savetxt(path, rows, "%.17g", ",", header=head, comments="")
+    assert outcome(*paths) == expected
+
+
+@pytest.mark.parametrize(
+    ("change", "expected"),
+    [
+        (lambda f: f["q"].attrs.update(units="deg"), "changed"),
+        (lambda f: f["t"].attrs.update(unit="us"), "changed"),
+        (lambda f: f["t"].attrs.update(epoch="1970"), "listed"),
+        (lambda f: f.attrs.update(rate=50.0), "listed"),
+        (lambda f: f.attrs.update(joint_nams=JOINTS), "listed"),
+        (lambda f: f.create_group("scene"), "listed"),
+        (lambda f: f.move("q", "q0"), "refused"),
+        (lambda f: f.move("t", "tt"), "refused"),
+    ],
+)
+def test_elements_of_hdf5(
+    tmp_path: Path, change: Callable[[Any], Any], expected: str
+) -> None:
+    paths = tmp_path / "a.h5", tmp_path / "b.h5"
+    for path in paths:
+        with h5py.File(path, "w") as file:
+            file["t"], file["q"] = T, Q
+            if path is paths[1]:
+                change(file)
+    assert outcome(*paths) == expected
+
+
+def test_units_in_the_metadata_of_parquet(tmp_path: Path) -> None:
+    pyarrow = pytest.importorskip("pyarrow")
+    parquet = pytest.importorskip("pyarrow.parquet")
+    columns = {"t": T} | dict(zip(JOINTS, Q.T, strict=True))
+    plain = pyarrow.table(columns)
+    fields = [
+        pyarrow.field(name, pyarrow.float64(), metadata={"unit": "deg"})
+        if name == "joint_1"
+        else pyarrow.field(name, pyarrow.float64())
+        for name in columns
+    ]
+    arrays = [pyarrow.array(values) for values in columns.values()]
+    in_fields = pyarrow.table(arrays, schema=pyarrow.schema(fields))
+    in_table = plain.replace_schema_metadata({"units": json.dumps({"t": "us"})})
+    for table, expected in ((in_fields, "changed"), (in_table, "changed")):
+        parquet.write_table(plain, tmp_path / "a.parquet")
+        parquet.write_table(table, tmp_path / "b.parquet")
+        assert outcome(tmp_path / "a.parquet", tmp_path / "b.parquet") == expected
+
+
+def test_positions_of_joints_that_are_not_planned(tmp_path: Path) -> None:
+    """Arrays of an archive and the file beside exported plans are compared with the problem."""
+    for position, expected in ((0.0, "silent"), (0.1, "refused")):
+        held = {"held_joint_names": np.array(["joint_7"])}
+        held["held_joint_positions"] = np.array([position])
+        np.savez(tmp_path / "a.npz", t=T, q=Q)
+        np.savez(tmp_path / "b.npz", t=T, q=Q, **held)
+        assert outcome(tmp_path / "a.npz", tmp_path / "b.npz") == expected
+    folder = tmp_path / "plans"
+    folder.mkdir()
+    rows = np.column_stack([T, Q])
+    head = ",".join(HEAD[:7])
+    np.savetxt(folder / "plan_0.csv", rows, "%.17g", ",", header=head, comments="")
+    (folder / "held_joints.yaml").write_text('"joint_7": 0.2\n')
+    with pytest.raises(UsageError, match=r"'joint_7' is held at 0\.2"):
+        load_trajectories(folder, "airhockey")

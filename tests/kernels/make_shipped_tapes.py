@@ -1,0 +1,101 @@
+"""Make the tapes of shipped problems that the package has as data.
+
+    python -m tests.kernels.make_shipped_tapes
+
+All tapes are built, whatever is stored. The robots of example-robot-data must be installed. Kernels of
+training, which takes minutes anyway, are left out: they are half of all instructions.
+"""
+
+import json
+import tempfile
+import zipfile
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from hashlib import sha256
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from cnpgen.kernels import library, shipped_tapes
+from cnpgen.kernels.interpreted_kernel import InterpretedGridKernel, InterpretedKernel
+from cnpgen.kernels.library import KernelLibrary
+from cnpgen.kernels.tape import Tape
+from cnpgen.make.recipe import load_dataset_recipe
+from cnpgen.pipelines.prepared import PreparedPipeline
+from cnpgen.planner.planner import Planner
+from cnpgen.problems.load_robot import load_robot
+from cnpgen.problems.obstacles import with_capacity
+from cnpgen.problems.problem_file import load_problem
+from cnpgen.refine.refiner import Refiner
+
+ROOT = Path(__file__).parents[2]
+
+
+@contextmanager
+def recorded() -> Iterator[dict[str, Tape]]:
+    """Record tapes under their keys; in the context they are built, and no machine code is made."""
+    tapes: dict[str, Tape] = {}
+    build = KernelLibrary._tape
+
+    def record(self: KernelLibrary, builder: Callable[..., Any], *args: Any, **options: Any) -> Tape:  # fmt: skip
+        keys: list[str] = []
+        with pytest.MonkeyPatch.context() as inner:
+            inner.setattr(library, "find_shipped", keys.append)
+            tape = build(self, builder, *args, **options)
+        return tapes.setdefault(keys[0], tape)
+
+    with pytest.MonkeyPatch.context() as patch, tempfile.TemporaryDirectory() as cache:
+        patch.setenv("CNPGEN_CACHE", cache)
+        patch.setattr(KernelLibrary, "_tape", record)
+        patch.setattr(library, "CompiledKernel", lambda tape, _: InterpretedKernel(tape))  # fmt: skip
+        patch.setattr(library, "CompiledGridKernel", lambda tape, _: InterpretedGridKernel(tape))  # fmt: skip
+        patch.setattr(library, "_try_generator", lambda _: None)
+        yield tapes
+
+
+def load_kernels(name: str) -> None:
+    """Load all kernels of a shipped dataset: of its pipeline, the solver and the planner."""
+    pipeline = load_dataset_recipe(name).pipeline
+    backend, cache = library.choose_backend(None)
+    problem = PreparedPipeline(pipeline, backend=backend, cache_folder=cache).context.problem  # fmt: skip
+    Refiner(problem, load_robot(problem))
+    if (ROOT / f"datasets/models/{name}.h5").exists():
+        Planner(name)
+
+
+def load_all() -> None:
+    """Load all kernels of shipped datasets, and those of the solver for scenes of a Panda."""
+    for path in sorted((ROOT / "datasets").glob("*.toml")):
+        load_kernels(path.stem)
+        print(path.stem, flush=True)
+    # They do not depend on the number of obstacles.
+    scenes = with_capacity(load_problem("panda"), {"box": 1})
+    Refiner(scenes, load_robot(scenes))
+
+
+def names_of(tapes: dict[str, Tape]) -> dict[str, str]:
+    """Return key -> digest of the content."""
+    return {key: sha256(tape.to_bytes()).hexdigest()[:32] for key, tape in sorted(tapes.items())}  # fmt: skip
+
+
+def write(tapes: dict[str, Tape], folder: Path) -> None:
+    """Write the index and the archive; equal tapes give equal bytes."""
+    folder.mkdir(exist_ok=True)
+    names = names_of(tapes)
+    (folder / shipped_tapes.INDEX).write_text(json.dumps(names, indent=0) + "\n", encoding="ascii")  # fmt: skip
+    contents = {names[key]: tape.to_bytes() for key, tape in tapes.items()}
+    with zipfile.ZipFile(folder / shipped_tapes.ARCHIVE, "w", zipfile.ZIP_LZMA) as archive:  # fmt: skip
+        for name in sorted(contents):
+            archive.writestr(zipfile.ZipInfo(name), contents[name], zipfile.ZIP_LZMA)
+
+
+def main() -> None:
+    """Make the files of the package."""
+    with recorded() as tapes:
+        load_all()
+    write(tapes, shipped_tapes.FOLDER)
+
+
+if __name__ == "__main__":
+    main()

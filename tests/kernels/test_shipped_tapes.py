@@ -1,0 +1,102 @@
+"""Tapes that the package has as data: equal to those of the present sources, found by them only, optional."""
+
+import json
+from collections.abc import Iterator
+from hashlib import sha256
+from pathlib import Path
+from zipfile import ZipFile
+
+import pytest
+
+from cnpgen.kernels import library as library_module
+from cnpgen.kernels import shipped_tapes
+from cnpgen.kernels.library import KernelLibrary
+from cnpgen.kernels.symbolic.kinematics import tip_position
+from tests.conftest import Prepare
+from tests.examples.example_robots import needs_robots
+from tests.kernels import make_shipped_tapes
+
+MAKE = "make them again: python -m tests.kernels.make_shipped_tapes"
+
+
+@pytest.mark.parametrize(
+    "name", ["airhockey-hit", pytest.param("heavy-object", marks=pytest.mark.slow)]
+)
+def test_stored_tapes_are_those_of_the_sources(name: str) -> None:
+    """The archive has all tapes of a dataset, with the bytes of those that its builders make."""
+    with make_shipped_tapes.recorded() as tapes:
+        make_shipped_tapes.load_kernels(name)
+    assert len(tapes) > 10
+    with ZipFile(shipped_tapes.FOLDER / shipped_tapes.ARCHIVE) as archive:
+        missing = set(make_shipped_tapes.names_of(tapes).values()).difference(
+            archive.namelist()
+        )
+    assert not missing, MAKE
+
+
+@pytest.mark.slow
+@needs_robots
+def test_the_index_names_all_tapes_of_shipped_datasets_for_the_present_sources() -> None:  # fmt: skip
+    """The index is the one that making it again gives, and the archive has what it names, nothing else."""
+    with make_shipped_tapes.recorded() as tapes:
+        make_shipped_tapes.load_all()
+    index = json.loads((shipped_tapes.FOLDER / shipped_tapes.INDEX).read_text())
+    assert index == make_shipped_tapes.names_of(tapes), MAKE
+    with ZipFile(shipped_tapes.FOLDER / shipped_tapes.ARCHIVE) as archive:
+        assert sorted(archive.namelist()) == sorted(set(index.values()))
+        for name in archive.namelist():
+            assert sha256(archive.read(name)).hexdigest()[:32] == name
+
+
+@pytest.fixture
+def kernels(
+    prepare: Prepare, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> Iterator[KernelLibrary]:
+    """A library of kernels whose package has one tape: that of the position of the tip."""
+    library = prepare("airhockey-hit").context.kernels
+    with make_shipped_tapes.recorded() as tapes:
+        library.tape(tip_position)
+    make_shipped_tapes.write(tapes, tmp_path)
+    monkeypatch.setattr(shipped_tapes, "FOLDER", tmp_path)
+    shipped_tapes._index.cache_clear()
+    yield library
+    shipped_tapes._index.cache_clear()
+
+
+def builds(library: KernelLibrary, monkeypatch: pytest.MonkeyPatch) -> bool:
+    """Whether the tape is built by CasADi, with an empty cache."""
+    built: list[object] = []
+
+    def build(function: object, *args: object, **options: object) -> object:
+        built.append(function)
+        return make(function, *args, **options)
+
+    make = library_module.tape_from_function
+    with monkeypatch.context() as patch:
+        patch.setattr(library_module, "tape_from_function", build)
+        patch.setattr(KernelLibrary, "_cached", lambda _, name: None)
+        library.tape(tip_position)
+    return bool(built)
+
+
+def test_a_stored_tape_is_used_by_its_sources_only(
+    kernels: KernelLibrary, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A changed source gives another key, so that the tape is built."""
+    assert not builds(kernels, monkeypatch)
+    monkeypatch.setattr(library_module, "_source_digests", lambda _: ["changed"])
+    assert builds(kernels, monkeypatch)
+
+
+@pytest.mark.parametrize("name", [shipped_tapes.INDEX, shipped_tapes.ARCHIVE])
+@pytest.mark.parametrize("content", [b"", b"{", b"PK damaged", None])
+def test_damaged_and_missing_files_are_ignored(
+    kernels: KernelLibrary,
+    content: bytes | None,
+    name: str,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Without a usable file the tape is built."""
+    file = shipped_tapes.FOLDER / name
+    file.unlink() if content is None else file.write_bytes(content)
+    assert builds(kernels, monkeypatch)
