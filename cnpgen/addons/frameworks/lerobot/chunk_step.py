@@ -1,4 +1,4 @@
-"""The bridge to LeRobot: a processor step that makes every action chunk of a policy a valid motion.
+"""The step that executes chunks in the processors of LeRobot.
 
 LeRobot's real-time chunking calls ``postprocessor(actions)`` on a whole chunk, and its
 queue then drops the samples that are due before the result. So the step returns
@@ -32,8 +32,6 @@ from cnpgen.schema.arguments import number, numbers
 with requires_extra("lerobot", "lerobot"):
     import torch
     from lerobot.processor import ProcessorStep, ProcessorStepRegistry, TransitionKey
-
-__all__ = ["ChunkStep"]
 
 STATE = "observation.state"
 RADIANS = {"rad": 1.0, "deg": float(np.pi / 180)}
