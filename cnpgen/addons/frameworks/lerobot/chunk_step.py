@@ -30,7 +30,6 @@ from cnpgen.problems.problem_record import as_record
 from cnpgen.schema.arguments import number, numbers
 
 with requires_extra("lerobot", "lerobot"):
-    import torch
     from lerobot.processor import ProcessorStep, ProcessorStepRegistry, TransitionKey
 
 STATE = "observation.state"
@@ -207,7 +206,7 @@ class ChunkStep(ProcessorStep):  # type: ignore[misc] # LeRobot has no types
             others = point.others if point.others.size else seen.others
             row[:n] = (point.q - self._zero) / self._factor
             row[n:] = others[: len(row) - n]
-        return torch.as_tensor(chunk[None]).to(action)
+        return action.new_tensor(chunk[None])
 
     def _radians(self, values: Array) -> Array:
         return np.asarray(self._zero + self._factor * values)
