@@ -396,6 +396,7 @@ def test_every_module_is_imported_or_registered() -> None:
         "__main__",
         "benchmark",
         "interop.jax",
+        "interop.lerobot",
         "interop.torch",
         "plugins",
         "recipes",
