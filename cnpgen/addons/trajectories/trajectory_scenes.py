@@ -38,7 +38,7 @@ from cnpgen.problems.problem_record import (
 )
 from cnpgen.problems.scenes.placement import placed_scene
 from cnpgen.problems.scenes.requested_problem import requested_problem
-from cnpgen.problems.scenes.scene_problem import SceneProblem
+from cnpgen.problems.scenes.scene_problem import SceneProblem, check_scenes
 from cnpgen.problems.scenes.scene_reader import ReadingOptions, read_scenes
 from cnpgen.robots.attached_links import attached_link_name
 from cnpgen.robots.obstacle import Obstacle
@@ -130,6 +130,7 @@ def _placed(
 ) -> tuple[Problem, Array]:
     """Return the problem with the obstacles of scenes, and their poses around each of some motions, (count, width)."""
     if not isinstance(scenes, str | Path):
+        check_scenes(scenes)
         placed, poses = _of_problems(problem, scenes)
     elif file_kind(Path(scenes)) == PLANS:
         placed, poses = _of_plans(problem, Path(scenes))

@@ -124,8 +124,10 @@ def _held_joints(path: Path) -> dict[str, float]:
     """Read the positions of joints that are not planned beside exported plans; empty without the file."""
     if not path.is_file():
         return {}
-    lines = read_file(path, max_bytes=MAX_TABLE_BYTES).decode().splitlines()
+    content = read_file(path, max_bytes=MAX_TABLE_BYTES)
     try:
+        # Bytes that are no UTF-8 raise a ValueError, too.
+        lines = content.decode().splitlines()
         pairs = [line.rsplit(":", 1) for line in lines if line.strip()]
         return {json.loads(name): float(value) for name, value in pairs}
     except ValueError as error:
