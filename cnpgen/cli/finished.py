@@ -10,10 +10,12 @@ from collections.abc import Iterator
 from contextlib import suppress
 from pathlib import Path
 
-from cnpgen.errors import UsageError
+from cnpgen.errors import CnpgenError, UsageError
 from cnpgen.machine.versions import __version__
-from cnpgen.store.files.atomic import file_sha256, write_file
-from cnpgen.store.files.documents import canonical_sha256
+from cnpgen.store.files.atomic import file_sha256, read_file, write_file
+from cnpgen.store.files.documents import canonical_sha256, parse_json
+
+MAX_REQUEST_BYTES = 4096
 
 
 def request_file(out: Path) -> Path:
@@ -35,8 +37,9 @@ def is_finished(out: Path, request: object, *, force: bool) -> bool:
     if force or not _is_there(out):
         return False
     document = {}
-    with suppress(OSError, ValueError):
-        document = json.loads(request_file(out).read_text(encoding="utf-8"))
+    with suppress(CnpgenError, ValueError):
+        content = read_file(request_file(out), max_bytes=MAX_REQUEST_BYTES)
+        document = parse_json(content.decode())
     if document == {"request": _digest(request), "result": content_sha256(out)}:
         return True
     raise UsageError(

@@ -1,6 +1,7 @@
 """Commands that are repeated, as by a requeued job: the same request ends with 0, another one is refused."""
 
 import json
+import os
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -102,4 +103,25 @@ def test_a_folder_is_compared_with_all_its_files(tmp_path: Path) -> None:
     assert is_finished(out, 1, force=False)
     (out / "data" / "b").write_text("")
     with pytest.raises(UsageError, match="was changed since"):
+        is_finished(out, 1, force=False)
+
+
+@pytest.mark.parametrize("kind", ["deep", "pipe", "folder", "long"])
+def test_a_damaged_request_is_of_no_result(tmp_path: Path, kind: str) -> None:
+    out = tmp_path / "p.h5"
+    out.write_bytes(b"")
+    record_request(out, 1)
+    assert is_finished(out, 1, force=False)
+    file = request_file(out)
+    content = file.read_text()
+    file.unlink()
+    if kind == "pipe":
+        os.mkfifo(file)
+    elif kind == "folder":
+        file.mkdir()
+    else:
+        file.write_text("[" * 4000 if kind == "deep" else content + " " * 5000)
+    with pytest.raises(
+        UsageError, match=r"--force replaces it, -o names another file$"
+    ):
         is_finished(out, 1, force=False)
