@@ -78,7 +78,7 @@ def number(name: str, value: Any) -> float:
             and np.ndim(value) == 0
         )
         found = float(value) if real else math.nan
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         found = math.nan
     if not math.isfinite(found):
         raise UnexpectedValueError("a finite number", f"{value!r:.100}", argument=name)
