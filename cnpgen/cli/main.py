@@ -77,6 +77,7 @@ BROKEN_PIPE = 141  # 128 + SIGPIPE, as shells have it
 # Arguments whose options have another name.
 _OPTIONS = {
     "discard": "force",
+    "initial": "initial_plans",
     "other": "other_rows",
 }
 

@@ -29,6 +29,29 @@ class _Help(argparse.RawDescriptionHelpFormatter):
         self._action_max_length = len("    make-dataset")
 
 
+class StoreOnce(argparse._StoreAction):
+    """Store the input that an option names, and refuse a second one, which would be lost."""
+
+    def __call__(
+        self,
+        parser: argparse.ArgumentParser,
+        namespace: argparse.Namespace,
+        values: Any,
+        option_string: str | None = None,
+    ) -> None:
+        """Store a value.
+
+        Raises:
+            argparse.ArgumentError: The option has another value already.
+        """
+        before = getattr(namespace, self.dest, self.default)
+        if option_string and before is not self.default and before != values:
+            raise argparse.ArgumentError(
+                self, f"names one input, got {before} and {values}"
+            )
+        super().__call__(parser, namespace, values, option_string)
+
+
 class Parser(argparse.ArgumentParser):
     """A parser that raises UsageError instead of printing its usage and leaving."""
 

@@ -131,11 +131,6 @@ def seconds_with_unit(text: str) -> float:
     return time
 
 
-def time_limit(text: str) -> float:
-    """Read a time in s or with its unit, or 0."""
-    return 0.0 if text.strip() == "0" else seconds(text)
-
-
 def _quantity(unit: str, expected: str, text: str) -> float:
     """Read a number above 0, in SI or with its unit."""
     from cnpgen.schema.units import parse_number
@@ -148,6 +143,12 @@ def _quantity(unit: str, expected: str, text: str) -> float:
     if number <= 0:
         raise ArgumentTypeError(f"expected {expected}; got {text!r}")
     return number
+
+
+def time_limit(text: str) -> float:
+    """Read a time in s or with its unit, or 0."""
+    expected = "0, or a time above 0, such as 0.1 or 100ms"
+    return 0.0 if text.strip() == "0" else _quantity("s", expected, text)
 
 
 seconds = partial(_quantity, "s", "a time above 0, such as 0.001 or 1ms")

@@ -47,6 +47,12 @@ def is_bag_folder(path: Path) -> bool:
     )
 
 
+def has_bags(path: Path) -> bool:
+    """Return whether a path is a bag, or a folder with bags."""
+    files = path.iterdir() if path.is_dir() else [path]
+    return any(file.suffix.lower() in BAG_SUFFIXES for file in files)
+
+
 def read_bag(path: Path, options: LoadOptions) -> Iterator[TrajectoryTable]:
     """Yield the trajectories of a bag: one of all joint states of a topic, or one of every other message.
 
@@ -91,7 +97,7 @@ def read_bag(path: Path, options: LoadOptions) -> Iterator[TrajectoryTable]:
             )
         ]
     for table in tables:
-        yield replace(table, unused=(*table.unused, *others))
+        yield replace(table, unused=(*table.unused, *map("topic {}".format, others)))
 
 
 def _topic(path: Path, bag: Any, stated: str | None) -> str:
@@ -105,7 +111,7 @@ def _topic(path: Path, bag: Any, stated: str | None) -> str:
         raise UsageError(
             f"{path} has no trajectories in the topic {stated!r}, only in"
             f" {listed(list(known), MAX_TOPICS) or 'none'}{nearest(stated, known)}",
-            argument="topic",
+            concerns="topic",
         )
     if not known:
         topics = sorted({f"{each.topic} ({each.msgtype})" for each in bag.connections})

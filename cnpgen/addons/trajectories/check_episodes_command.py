@@ -160,6 +160,7 @@ def _calibrated(path: Path, arm: "RecordedArm") -> list[float]:
     import math
 
     from cnpgen.store.files.atomic import read_file
+    from cnpgen.store.files.documents import parse_json
 
     if arm.steps_per_turn is None:
         raise UsageError(
@@ -167,18 +168,18 @@ def _calibrated(path: Path, arm: "RecordedArm") -> list[float]:
         )
     step, factors = 2 * math.pi / arm.steps_per_turn, []
     try:
-        document = json.loads(read_file(path, max_bytes=1 << 20))
+        document = parse_json(read_file(path, max_bytes=1 << 20).decode())
         for joint in arm.joints:
             entry = document[joint]
             steps = float(entry["range_max"]) - float(entry["range_min"])
             factors.append(steps / 200 * step)
     except (ValueError, KeyError, TypeError) as error:
         text = f"{path} is not a calibration of {arm.name}: {error!r:.120}"
-        raise UsageError(text, argument="calibration") from error
+        raise UsageError(text, concerns="calibration") from error
     if not all(0 < factor <= math.pi / 100 for factor in factors):
         # A turn for 200.
         text = f"{path}: every range must be above 0 and at most a turn of {arm.name}"
-        raise UsageError(text, argument="calibration")
+        raise UsageError(text, concerns="calibration")
     return factors
 
 

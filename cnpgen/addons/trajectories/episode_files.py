@@ -1,6 +1,5 @@
 """Episodes of recorded data: folders of LeRobot v3, HDF5 files of robomimic and Minari, and folders of CSV files."""
 
-import json
 import os
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -93,7 +92,7 @@ def read_recording(
         folder = Path(home).expanduser() / path
     if not folder.exists():
         text = f"{path} is not there, neither as a path nor in {folder.parent}"
-        raise UsageError(text, argument="path")
+        raise UsageError(text, concerns="path")
     if (folder / LEROBOT_INFO).is_file():
         return _read_lerobot(folder)
     if folder.is_file() and folder.suffix.lower() in HDF5_SUFFIXES:
@@ -113,10 +112,10 @@ def _read_lerobot(folder: Path) -> Recording:
         text = (
             f"{folder / LEROBOT_INFO} does not describe measured states: {error!r:.200}"
         )
-        raise UsageError(text, argument="path") from error
+        raise UsageError(text, concerns="path") from error
     if not version.startswith("v3"):
         text = f"{folder} has LeRobot's format {version}, expected v3.0"
-        raise UsageError(text, argument="path")
+        raise UsageError(text, concerns="path")
     lengths = _stated_lengths(folder)
     episodes = []
     for file in sorted(folder.glob("data/*/*.parquet")):
@@ -124,7 +123,7 @@ def _read_lerobot(folder: Path) -> Recording:
         for name in ("timestamp", "episode_index", "frame_index", STATE):
             if name not in table.column_names:
                 raise UsageError(
-                    f"{file}: there is no column {name!r}", argument="path"
+                    f"{file}: there is no column {name!r}", concerns="path"
                 )
         number = _column(table, "episode_index", file, 1)[:, 0]
         t = _column(table, "timestamp", file, 1)[:, 0]
@@ -144,7 +143,7 @@ def _read_lerobot(folder: Path) -> Recording:
                 )
             )
     if not episodes:
-        raise UsageError(f"{folder} holds no episodes", argument="path")
+        raise UsageError(f"{folder} holds no episodes", concerns="path")
     return Recording(tuple(episodes), robot, "lerobot")
 
 
@@ -178,7 +177,7 @@ def _column(table: Any, name: str, file: Path, width: int) -> Array:
         return values.reshape(table.num_rows, width)
     except (TypeError, ValueError) as error:
         text = f"{file}: column {name!r}: expected {width} numbers per row"
-        raise UsageError(text, argument="path") from error
+        raise UsageError(text, concerns="path") from error
 
 
 def _read_hdf5(path: Path, key: str | None, rate: float | None) -> Recording:
@@ -197,9 +196,9 @@ def _read_hdf5(path: Path, key: str | None, rate: float | None) -> Recording:
             episodes = tuple(_hdf5_episodes(path, root, key, rate))
     except (DatasetError, KeyError) as error:
         text = f"{path} is not a file of episodes, or is damaged: {error!s:.200}"
-        raise UsageError(text, argument="path") from error
+        raise UsageError(text, concerns="path") from error
     if not episodes:
-        raise UsageError(f"{path} holds no episodes", argument="path")
+        raise UsageError(f"{path} holds no episodes", concerns="path")
     return Recording(episodes, "", "hdf5")
 
 
@@ -220,7 +219,7 @@ def _hdf5_episodes(path: Path, root: Any, key: str, rate: float) -> Iterator[Epi
         state = np.asarray(group[key], float)
         if state.ndim != 2:
             text = f"{path}: {name}/{key} must have two dimensions, got {state.shape}"
-            raise UsageError(text, argument="path")
+            raise UsageError(text, concerns="path")
         frame = np.arange(len(state))
         names = tuple(map(str, range(state.shape[1])))
         yield Episode(name, frame / rate, state, None, names, frame)
@@ -229,7 +228,8 @@ def _hdf5_episodes(path: Path, root: Any, key: str, rate: float) -> Iterator[Epi
 def _control_rate(text: str | bytes) -> float | None:
     """Return the control frequency that robomimic's description of the environment states [Hz]."""
     try:
-        found = json.loads(text)["env_kwargs"]["control_freq"]
+        plain = text.decode() if isinstance(text, bytes) else text
+        found = parse_json(plain)["env_kwargs"]["control_freq"]
         return float(found) if float(found) > 0 else None
     except (ValueError, KeyError, TypeError):
         return None
@@ -248,7 +248,7 @@ def _read_tables(path: Path, rate: float | None) -> Recording:
         names = tuple(name for name in columns if name not in times)
         if not names:
             raise UsageError(
-                f"{table.place} has no columns of numbers", argument="path"
+                f"{table.place} has no columns of numbers", concerns="path"
             )
         state = np.stack([columns[name] for name in names], axis=1)
         frame = np.arange(len(state))
@@ -270,5 +270,5 @@ def chosen(recording: Recording, episodes: Sequence[int] | None) -> tuple[Episod
     missing = [k for k, episode in zip(episodes, found, strict=True) if episode is None]
     if missing:
         text = f"there is no episode {missing[0]}: {len(recording.episodes)} are numbered from 0"
-        raise UsageError(text, argument="episodes")
+        raise UsageError(text, concerns="episodes")
     return tuple(episode for episode in found if episode is not None)

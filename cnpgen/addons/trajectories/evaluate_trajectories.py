@@ -238,7 +238,14 @@ def _check_scene(index: int, trajectory: Trajectory, problem: Problem) -> None:
     """Check that a trajectory has the obstacles that samples of a problem place."""
     if trajectory.obstacle_poses is not None:
         obstacles = tuple(problem.obstacle)
-        # Checks the shape and the values.
+        got = len(trajectory.obstacle_poses)
+        if got != pose_width(obstacles):
+            text = (
+                f"trajectory {index} has a scene of {got} numbers, and {problem.name!r}"
+                f" takes {pose_width(obstacles)}: its scene file as {{scenes}} adds the obstacles"
+            )
+            raise UsageError(text, concerns="trajectories", remedies={"scenes": None})
+        # Checks the values.
         Scene(obstacles, np.empty((1, pose_width(obstacles)))).with_poses(
             trajectory.obstacle_poses[None]
         )

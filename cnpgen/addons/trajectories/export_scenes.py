@@ -7,7 +7,7 @@
 import argparse
 
 from cnpgen.cli import export_command, recipe_names
-from cnpgen.cli.parser import Options
+from cnpgen.cli.parser import Options, StoreOnce
 from cnpgen.errors import UsageError
 
 
@@ -15,7 +15,11 @@ def add_options(options: Options) -> None:
     """Add the option of the scenes."""
     text = "obstacles around plans that have none: a file of scenes or of plans; one for each plan, or one for all"
     options.add_argument(
-        "--scenes", metavar="FILE", type=recipe_names.present, help=text
+        "--scenes",
+        metavar="FILE",
+        type=recipe_names.present,
+        action=StoreOnce,
+        help=text,
     )
 
 

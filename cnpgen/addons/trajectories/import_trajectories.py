@@ -133,7 +133,7 @@ def import_trajectories(
     poses = [trajectory.obstacle_poses for trajectory in trajectories]
     placed = [row for row in poses if row is not None]
     if 0 < len(placed) < len(poses):
-        raise UsageError("some have scenes and others not", argument="trajectories")
+        raise UsageError("must all have scenes, or none", argument="trajectories")
     plans = make_plans(
         record,
         join_boundaries(boundaries),

@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from cnpgen.addons.trajectories.bag_tables import has_bags
 from cnpgen.addons.trajectories.load_options import LoadOptions
 from cnpgen.addons.trajectories.sampled_trajectory import Trajectory
 from cnpgen.addons.trajectories.table_columns import TIME_NAMES
@@ -128,7 +129,10 @@ def load_trajectories(
         error.argument = error.argument or "path"
         raise
     if not trajectories:
-        raise UsageError(f"{path} holds no trajectory", argument="path")
+        raise UsageError(f"{path} holds no trajectory", concerns="path")
+    if chosen.topic is not None and not has_bags(Path(path)):
+        text = f"is for bags of ROS, got {path}, which is none"
+        raise UsageError(text, argument="topic")
     if chosen.unit == "rad":
         _check_unit(path, robot, [trajectory.q for trajectory in trajectories])
     for reader, trajectory in zip(readers, trajectories, strict=True):
@@ -252,5 +256,5 @@ def _check_parameters(record: ProblemRecord, parameters: Mapping[str, float]) ->
             )
             raise UsageError(
                 f"{name!r} is not a parameter of {record.name!r}: {expected}",
-                argument="parameters",
+                concerns="parameters",
             )

@@ -316,7 +316,7 @@ class TableReader:
             raise UsageError(
                 f"{self.table.place}: there is no column {name!r}, only {listed(list(columns), MAX_LISTED)}"
                 f"{nearest(name, columns)}",
-                argument=argument,
+                concerns=argument,
             )
         return keys[key]
 

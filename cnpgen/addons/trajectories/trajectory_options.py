@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from cnpgen.cli import recipe_names, values
-from cnpgen.cli.parser import Options, options_of
+from cnpgen.cli.parser import Options, StoreOnce, options_of
 from cnpgen.cli.terminal import table
 from cnpgen.cli.verdict_text import margin_cells, margin_head
 from cnpgen.errors import UsageError, counted, listed
@@ -86,9 +86,15 @@ def add_trajectory_options(option: Options) -> None:
     text = "values of the problem's parameters that the file does not have, such as payload_mass=6kg"
     add("--parameters", metavar="NAME=V,...", type=values.parameters, help=text)
     text = "obstacles around the trajectories: a file of scenes or of plans; one for each trajectory, or one for all"
-    add("--scenes", metavar="FILE", type=recipe_names.present, help=text)
+    add(
+        "--scenes",
+        metavar="FILE",
+        type=recipe_names.present,
+        action=StoreOnce,
+        help=text,
+    )
     text = "topic of a bag of ROS, if several have trajectories"
-    add("--topic", metavar="NAME", help=text)
+    add("--topic", metavar="NAME", action=StoreOnce, help=text)
     text = "element of a message or scene that may be left unused; may be repeated"
     add("--allow-unused", metavar="KEY", action="append", help=text)
     text = "body at the tip, in place of the problem's: mass [kg], or mass and centre of mass in the tip frame [m]"
@@ -146,7 +152,7 @@ def load_file(
     loaded = load_trajectories(arguments.file, problem, options=reading, **given)
     if loaded.ignored:
         print(
-            f"columns that are not used: {listed(loaded.ignored, MAX_IGNORED)}",
+            f"not used: {listed(loaded.ignored, MAX_IGNORED)}",
             file=sys.stderr,
         )
     for note in loaded.notes[:MAX_NOTES]:

@@ -51,6 +51,7 @@ from cnpgen.store.files.kind import PLANS
 from cnpgen.store.paths import file_kind
 from cnpgen.store.scene_table import OBSTACLE_POSES
 
+MAX_ROUNDING = 1e-6  # of poses and sizes in float32
 _KINDS: tuple[Kind, ...] = ("problem", "pipeline", "dataset")
 
 
@@ -80,15 +81,14 @@ def with_scenes(
     """Place the obstacles of scenes around trajectories: one scene for each, or one for all.
 
     Return the problem with as many further obstacles as the scenes have, and the
-    trajectories with their poses and sizes.
+    trajectories with their poses and sizes. Those of trajectories that have scenes
+    already, such as float32 ones of a LeRobotDataset, must be the same.
 
     Raises:
         UsageError: The number of scenes is wrong, a plan file has no scenes or is of a
-            problem with other obstacles, or the trajectories have scenes already.
+            problem with other obstacles, or a trajectory has another scene.
         DatasetError, MissingExtraError: as of the readers of scenes and plans.
     """
-    if any(trajectory.obstacle_poses is not None for trajectory in trajectories):
-        raise UsageError("the trajectories have scenes of their own", argument="scenes")
     placed, rows = _placed(
         as_problem(record),
         scenes,
@@ -96,6 +96,14 @@ def with_scenes(
         len(trajectories),
         allow_unused,
     )
+    for index, (trajectory, row) in enumerate(zip(trajectories, rows, strict=True)):
+        own = trajectory.obstacle_poses
+        if own is not None and not (
+            own.shape == row.shape
+            and np.allclose(own, row, rtol=MAX_ROUNDING, atol=MAX_ROUNDING)
+        ):
+            text = f"trajectory {index} has another scene of its own"
+            raise UsageError(text, concerns="scenes")
     pairs = zip(trajectories, rows, strict=True)
     return record_problem(placed), tuple(
         replace(trajectory, obstacle_poses=row.copy()) for trajectory, row in pairs
@@ -108,7 +116,7 @@ def plans_in_scenes(plans: Plans, scenes: str | Path) -> Plans:
     The status of the plans is unknown then. Errors are those of ``with_scenes``.
     """
     if OBSTACLE_POSES in plans.columns:
-        raise UsageError("the plans have scenes of their own", argument="scenes")
+        raise UsageError("the plans have scenes of their own", concerns="scenes")
     count = len(plans)
     placed, rows = _placed(
         as_problem(plans.problem), scenes, counted(count, "plan"), count, ()
@@ -170,19 +178,19 @@ def _of_plans(problem: Problem, path: Path) -> tuple[Problem, Array]:
     if OBSTACLE_POSES not in plans.columns:
         raise UsageError(
             f"{path} has no scenes: its plans have no column {OBSTACLE_POSES}",
-            argument="scenes",
+            concerns="scenes",
         )
     other = as_problem(plans.problem)
     if other.own_obstacles != problem.own_obstacles:
         raise UsageError(
             f"{path} is of {other.name!r}, whose obstacles are others than those of {problem.name!r}",
-            argument="scenes",
+            concerns="scenes",
         )
     if lost := _lost_demands(problem, other):
         raise UsageError(
             f"{path} is of a problem with {listed(lost)}, which {problem.name!r} lacks:"
             " give the scene file of its request",
-            argument="scenes",
+            concerns="scenes",
         )
     return problem.with_obstacles(other.obstacle), plans.columns[OBSTACLE_POSES]
 

@@ -1,6 +1,5 @@
 """Files of sampled trajectories as tables: the reader of every suffix, and folders of files."""
 
-import json
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -129,7 +128,7 @@ def _held_joints(path: Path) -> dict[str, float]:
         # Bytes that are no UTF-8 raise a ValueError, too.
         lines = content.decode().splitlines()
         pairs = [line.rsplit(":", 1) for line in lines if line.strip()]
-        return {json.loads(name): float(value) for name, value in pairs}
+        return {parse_json(name): float(value) for name, value in pairs}
     except ValueError as error:
         raise UsageError(
             f"{path} must have lines of a joint and its position"

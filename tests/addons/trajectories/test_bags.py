@@ -119,9 +119,14 @@ def test_one_of_several_topics_is_named(
         load_trajectories(path, "airhockey")
     with pytest.raises(UsageError, match="did you mean '/plan'"):
         load_trajectories(path, "airhockey", options=LoadOptions(topic="/plam"))
+    np.savez(tmp_path / "rows.npz", t=T, q=Q)
+    with pytest.raises(UsageError, match=r"^topic is for bags of ROS, got .*rows\.npz"):
+        load_trajectories(
+            tmp_path / "rows.npz", "airhockey", options=LoadOptions(topic="/plan")
+        )
     given = ["--problem", "airhockey", "--topic", "/plan"]
     assert main(["evaluate", str(path), *given]) in {0, 1}
-    assert "columns that are not used: /joint_states" in capsys.readouterr().err
+    assert "not used: topic /joint_states" in capsys.readouterr().err
 
 
 def test_bags_without_trajectories_or_times_are_refused(tmp_path: Path) -> None:

@@ -126,8 +126,28 @@ def test_a_dataset_of_lerobot_has_its_scenes(lines: Plans, tmp_path: Path) -> No
     assert not found.verdicts[0].valid
     decisions = [v.conditions["robot clearance"].decision for v in found.verdicts]
     assert decisions == ["invalid", "valid"]
-    with pytest.raises(UsageError, match="have scenes of their own"):
+    with pytest.raises(UsageError, match="trajectory 0 has another scene of its own"):
         load_trajectories(tmp_path / "le", lines.problem, scenes=[scene(1.0)])
+
+
+def test_the_scenes_of_a_dataset_of_lerobot_add_their_obstacles_to_a_problem(
+    lines: Plans,
+    files: tuple[Path, Path],
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    pytest.importorskip("pyarrow")
+    cnpgen.export_plans(lines, tmp_path / "le", to="lerobot", rate=100)
+    words = ["evaluate", str(tmp_path / "le"), "--problem", "panda-3kg"]
+    assert main(words) == 2
+    err = capsys.readouterr().err
+    assert "numbers, and 'panda-3kg' takes 0: its scene file as --scenes adds" in err
+    assert main([*words, "--scenes", str(files[1])]) == 1
+    assert "1 invalid, 1 a valid motion exists" in capsys.readouterr().out
+    for option in ("--scenes", "--topic"):
+        given = [option, str(files[0]), option, str(files[1])]
+        assert main([*words, *given]) == 2
+        assert f"{option}: names one input, got " in capsys.readouterr().err
 
 
 def test_export_takes_scenes_for_plans_without(
