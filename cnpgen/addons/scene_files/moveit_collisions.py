@@ -97,6 +97,7 @@ def _allowed_pairs(matrix: Any, place: str) -> Iterator[frozenset[str]]:
     rows = part(matrix, "entry_values", list, place)
     if len(rows) != len(names):
         raise SceneError(f"{place}: {ACM} needs one entry for each name")
+    allowed = dict[frozenset[str], bool]()
     for first, row in zip(names, rows, strict=True):
         # robowflex writes the rows as plain lists
         enabled = (
@@ -105,8 +106,12 @@ def _allowed_pairs(matrix: Any, place: str) -> Iterator[frozenset[str]]:
         if len(enabled) != len(names):
             raise SceneError(f"{place}: {ACM} needs one value for each pair")
         for second, value in zip(names, enabled, strict=True):
-            if is_true(value, f"{place}: {ACM}") and first != second:
-                yield frozenset({first, second})
+            flag, pair = is_true(value, f"{place}: {ACM}"), frozenset({first, second})
+            # Both entries of a pair, and those of repeated names.
+            if allowed.setdefault(pair, flag) != flag and first != second:
+                text = f"{ACM} allows and forbids {first} and {second}"
+                raise SceneError(f"{place}: {text}")
+    yield from (pair for pair, flag in allowed.items() if flag and len(pair) > 1)
 
 
 def read_link_sizes(

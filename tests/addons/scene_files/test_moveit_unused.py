@@ -259,8 +259,8 @@ OTHER = {  # entry of the tables -> place in the document, and another value
         0.2,
     ),
     ".allowed_collision_matrix": (
-        ("allowed_collision_matrix", "entry_values", 0, "enabled"),
-        [False, False],
+        ("allowed_collision_matrix", "entry_values"),
+        [{"enabled": [False, False]}, {"enabled": [False, False]}],
     ),
     ".group_name": (("group_name",), "hand"),
     ".pipeline_id": (("pipeline_id",), "pilz"),

@@ -756,3 +756,10 @@ def test_elements_that_are_not_used_do_not_change_plans_and_verdicts(tmp_path):
         report = [verdict.to_dict() for verdict in verdicts.verdicts]
         found.append((bytes_of, plans.problem, verdicts.summary(), report))
     assert found[0] == found[1]
+
+
+def test_a_matrix_that_allows_and_forbids_a_pair_is_refused(tmp_path: Path) -> None:
+    content = matrix(("post", "panda_link5"))
+    content["entry_values"][1] = [False] * len(content["entry_names"])
+    with pytest.raises(SceneError, match="allows and forbids post and panda_link5"):
+        scene_of(tmp_path, request() | {"allowed_collision_matrix": content})
