@@ -208,8 +208,12 @@ def _moving(  # noqa: PLR0917 - all of them are shown
         curves=[
             {"name": name, "shares": share.round(SHARE_DIGITS).tolist()}
             for name, share in shares.items()
+            # Of positions alone, accelerations and torques are nan.
+            if np.isfinite(share).any()
         ],
-        conditions=[_condition(curve) for curve in curves],
+        conditions=[
+            _condition(curve) for curve in curves if np.isfinite(curve.values).any()
+        ],
         verdict=_verdict(verdict, curves, times, poses, robot.joint_names),
     )
 

@@ -705,6 +705,9 @@ def test_conditions_that_samples_do_not_determine_have_no_number(tmp_path):
         "joint torque",
     ]
     assert not any("e+0" in text for text in texts.values())
+    assert [curve["name"] for curve in page["curves"]] == ["position", "velocity"]
+    drawn = {curve["name"] for curve in page["conditions"]}
+    assert not any("acceleration" in name or "torque" in name for name in drawn)
 
 
 @needs_meshcat
