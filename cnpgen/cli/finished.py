@@ -35,8 +35,10 @@ def is_finished(out: Path, request: object, *, force: bool) -> bool:
     if force or not _is_there(out):
         return False
     document = {}
+    # A missing or damaged request is that of no result.
     with suppress(OSError, ValueError):
         document = json.loads(request_file(out).read_text(encoding="utf-8"))
+    # The checksum of the result shows whether it was changed since.
     if document == {"request": _digest(request), "result": content_sha256(out)}:
         return True
     raise UsageError(

@@ -103,12 +103,14 @@ def run(arguments: argparse.Namespace) -> int:
     _complete(arguments)
     model = load_model(arguments.model)
     requests = _requests(arguments, model)
+    # What the result depends on: model, boundary conditions, further columns, options.
     request = [
         content_sha256(find_model(arguments.model)),
         _checksums(requests.boundary.arrays()),
         _checksums({**requests.columns, "sample_id": requests.sample_id}),
         options_of(arguments, "no_time_scaling", "allow_large_angles"),
     ]
+    # With --refine, ``refine_and_save`` compares its own request.
     if not arguments.refine and is_finished(
         arguments.out, request, force=arguments.force
     ):

@@ -98,6 +98,7 @@ def _page_of_keys(kind: str) -> str:
     page = rendered_page("keys").rstrip()
     if kind == "all":
         return page
+    # The part of one kind: from its heading to the next one of this level.
     head = f"\n## {kind.capitalize()} files\n"
     return (head + page.partition(head)[2].partition("\n## ")[0]).strip()
 
