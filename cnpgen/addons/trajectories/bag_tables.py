@@ -63,6 +63,7 @@ def read_bag(path: Path, options: LoadOptions) -> Iterator[TrajectoryTable]:
     try:
         with AnyReader([path], default_typestore=store) as bag:
             topic = _topic(path, bag, options.topic)
+            # Topics that are not read are reported with the unused elements.
             others = sorted({each.topic for each in bag.connections} - {topic})
             connections = [each for each in bag.connections if each.topic == topic]
             _check_count(path, topic, sum(each.msgcount for each in connections))
@@ -140,6 +141,7 @@ def _plain(value: Any) -> Any:
         return {
             entry.name: _plain(getattr(value, entry.name))
             for entry in fields(value)
+            # Definitions of rosbags have constants and names that are no values.
             if not entry.name.startswith("__")
         }
     if isinstance(value, np.ndarray):
