@@ -49,7 +49,6 @@ class Bookshelf(SceneFamily):
                 (depth, width, SHELF_BOARD_M),
             )
         for name, side in (("left side", 0.5), ("right side", -0.5)):
-            # Sides stand between the outer edges of the boards.
             center = (depth / 2, side * (width - SHELF_BOARD_M), height / 2)
             shelf.box(name, center, (depth, SHELF_BOARD_M, height - SHELF_BOARD_M))
         objects = self.objects, self.object_width, self.object_height
@@ -130,7 +129,6 @@ class Cubby(SceneFamily):
         width, height, depth = (
             uniform(random, size) for size in (self.width, self.height, self.depth)
         )
-        # The inner walls cross here, near the middle.
         y, z = (
             (uniform(random, self.shift) - 0.5) * width,
             uniform(random, self.shift) * height,
@@ -156,8 +154,7 @@ class Cubby(SceneFamily):
                 (depth, thin, height - z - thin),
             ),
         }
-        # The wall is drawn for all cubbies, so equal draws give equal walls with or
-        # without it.
+        # All cubbies draw it, so merged ones have no other walls.
         removed = list(walls)[int(random.integers(len(walls)))]
         for name, (center, size) in walls.items():
             if not (self.merged and name == removed):

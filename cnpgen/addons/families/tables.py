@@ -54,7 +54,6 @@ class Tabletop(SceneFamily):
                 (depth / 2, 0, -BOARD_M / 2),
                 (depth, width, BOARD_M),
             )
-            # Objects stand away from the edges of the table.
             area = (0.08, depth - 0.08, -width / 2 + 0.08, width / 2 - 0.08)
             objects = self.objects, self.object_width, self.object_height
             place_objects(

@@ -47,7 +47,6 @@ def read_path_constraints(
                 f"{where}: orientation tolerances must be at least {MIN_LIMIT_RAD:g} rad,"
                 f" got {limits.tolist()}"
             )
-        # Only the orientation counts: its origin may be anywhere.
         frame, pose = table.resolve(frame, (np.zeros(3), rotation))
         a, b, c = limits.tolist()
         yield (
@@ -62,7 +61,6 @@ def read_path_constraints(
     for entry in part(constraints, "position_constraints", list, where):
         frame, link = _frame_and_link(entry, where)
         check_weight(entry, where)
-        # Regions are placed in their frame by one common pose.
         frame, pose = table.resolve(frame, (np.zeros(3), np.eye(3)))
         regions = _regions(part(entry, "constraint_region", dict, where), where)
         placed = tuple(moved_obstacle(each, pose) for each in regions)

@@ -63,7 +63,6 @@ def read_bag(path: Path, options: LoadOptions) -> Iterator[TrajectoryTable]:
     try:
         with AnyReader([path], default_typestore=store) as bag:
             topic = _topic(path, bag, options.topic)
-            # Topics that are not read are reported with the unused elements.
             others = sorted({each.topic for each in bag.connections} - {topic})
             connections = [each for each in bag.connections if each.topic == topic]
             _check_count(path, topic, sum(each.msgcount for each in connections))

@@ -178,7 +178,6 @@ def _boundary(
     allowed = max(MIN_SNAP_RAD, SNAP_FACTOR * float(noise[0]))
     given = [trajectory.dq is not None, trajectory.ddq is not None]
     snapper.set_parameters(trajectory.parameters)
-    # Goals of plans have no boundary acceleration.
     estimated = estimate.start_ddq[0], np.zeros(trajectory.q.shape[1])
     accelerations = estimated if trajectory.ddq is None else trajectory.ddq[[0, -1]]
     ends: tuple[tuple[End, Array, Array, Array], ...] = (

@@ -111,7 +111,6 @@ def judge_samples(
     detail = ""
     tries = _curves(trajectory, errors, limits, ends, exact=exact)
     for curve, step in tries:
-        # Joint limits come first: their proof needs no samples of the motion.
         excess = _joint_limit_excess(curve, limits)
         if excess is None:
             verdict = judge(curve, trajectory, scene=scene, step=step)
@@ -125,7 +124,6 @@ def judge_samples(
         detail = (
             f"a smooth curve within the errors is not valid: {excess}" if excess else ""
         )
-    # Errors that hardly change accelerations count as none.
     noise = np.zeros(3) if exact else moved.values
     if not np.isfinite(noise).all():
         return TrajectoryVerdict(

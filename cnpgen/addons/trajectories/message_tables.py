@@ -205,7 +205,6 @@ def _table_of_states(messages: Sequence[Any], place: str) -> TrajectoryTable:
         stamps.append(_seconds(stamp, f"{where}.header.stamp"))
         for key, column in _STATE_FIELDS.items():
             values = message.get(key) or []
-            # Velocities are optional, but then for all messages.
             if column != "q" and not values and not columns[column]:
                 continue
             if not isinstance(values, list) or len(values) != len(names):

@@ -84,8 +84,6 @@ def refuted_torques(
             h = float(t[centres[row] + lag] - t[centres[row] - lag]) / 2
             state = [values[row] for values in states]
             rest = _remainder(torques, state, h, error, largest)
-            # The torque that every curve within the limits reaches in the mean, and
-            # thus at some time.
             least = np.abs(mean[row]) - rest
             relative = (least - allowed.tolerance) / allowed.limit
             joint = int(relative.argmax())

@@ -75,8 +75,7 @@ def uncertainty_of(  # noqa: PLR0917 - the family, and everything that measures 
     # No point of the robot moves farther than sum_j reach_j |dq_j| for changes of q.
     reach = world.motion_bounds(family.max_positions())
     displacement = float((family.bounds[0] @ reach).max())
-    # Both ends of the motion place obstacles; bounds are relaxed by the tip at the
-    # start.
+    # Both ends place obstacles; the tip at the start relaxes bounds.
     ends = family.bounds[0][[0, -1]] @ reach
     placed = (
         float(ends.max())
@@ -93,7 +92,6 @@ def uncertainty_of(  # noqa: PLR0917 - the family, and everything that measures 
     starts = np.unique(
         np.linspace(0, len(s), min(MAX_BLOCKS, len(s)) + 1).astype(np.intp)
     )[:-1]
-    # A known curve in a known scene has no errors to measure.
     is_known = not any(bound.any() for bound in family.bounds)
     if smooth and (len(scenes) > 1 or not is_known):
         found = _changes(problem, family, world, scenes, smooth, s, starts)
