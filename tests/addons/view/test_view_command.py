@@ -686,6 +686,7 @@ def test_a_browser_shows_the_verdict_without_an_error(rejected, width):
     assert reddish.mean() > 0.003  # the badge and the violated conditions
 
 
+@needs_meshcat
 def test_conditions_that_samples_do_not_determine_have_no_number(tmp_path):
     path = tmp_path / "a.csv"
     t = np.arange(0, 0.6001, 0.01)
