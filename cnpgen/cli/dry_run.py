@@ -36,7 +36,6 @@ def spec_text(
     counts = [
         f"{split} {sum(task.split == split for task in files)}" for split in spec.splits
     ]
-    # Bytes: rows, what each shard adds, and the documents of the folder.
     size = (
         sum(spec.splits.values()) * row_bytes(spec)
         + len(files) * SHARD_OVERHEAD

@@ -193,8 +193,7 @@ def _allocate(tape: Tape) -> tuple[int, list[Step]]:
         tape.b.tolist(),
         tape.constant.tolist(),
     )
-    # Last instruction that reads each value; 0 for none, as instruction 0 reads no
-    # value.
+    # Last instruction that reads each value; 0 for none, as number 0 reads none.
     last = np.zeros(len(tape), int)
     for k, (code, a, b, _) in enumerate(zip(*columns, strict=True)):
         last[[a, b][: OPERATIONS[NAMES[code]]]] = k
@@ -211,10 +210,8 @@ def _allocate(tape: Tape) -> tuple[int, list[Step]]:
             continue
         operands = (a, b)[: OPERATIONS[name]]
         places = tuple(place[operand] for operand in operands)
-        # Both operands may be one value, whose row is to be freed once.
         dying = {operand for operand in operands if last[operand] == k}
-        # A result may take the row of an operand: NumPy works on one element after the
-        # other.
+        # A result may take the row of an operand, since operations are elementwise.
         free.extend(
             place[operand] for operand in dying if isinstance(place[operand], int)
         )
@@ -224,7 +221,6 @@ def _allocate(tape: Tape) -> tuple[int, list[Step]]:
         place[k] = row = free.pop() if free else count
         count = max(count, row + 1)
         program.append((name, row, (a, b) if name == "INPUT" else places))
-        # No instruction reads this value.
         if last[k] == 0:
             free.append(row)
     return max(count, 1), program

@@ -169,8 +169,7 @@ def check_grid(
         zip(arrays, (*tape.inputs, *tape.outputs), map(axis_names, axes), strict=True)
     ):
         shape = (width, *(size[name] for name in names))
-        # The distance of lanes has no meaning where there are fewer than two elements
-        # in a row.
+        # A row of one element has no distance of lanes.
         rows = (
             "lanes" not in names
             or size["lanes"] == 1

@@ -301,8 +301,7 @@ class BlockChunk:
                 for x in (cells, cells[rows - start])
             )
             self._cells[field.name] += np.stack(list(counts))
-        # Candidates from one accepted one to the next, with those of earlier batches
-        # for the first.
+        # Candidates per accepted one; those of earlier batches count for the first.
         attempts = np.diff(rows, prepend=start - 1 - self._waiting).astype(np.int64)
         self._waiting = (
             stop - 1 - int(rows[-1]) if len(rows) else self._waiting + stop - start

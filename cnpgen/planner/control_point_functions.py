@@ -88,7 +88,6 @@ def line_change(
         fixed_at_goal=fixed_at_goal,
         within_limits=within_limits,
     )
-    # The change is that of the straight line, so that it includes the offsets.
     change = _sums(offsets, change) if with_offsets else change
     columns = [ends_sx, *([offsets_sx] if with_offsets else []), rate, poses_sx]
     return ca.Function("line_change", columns, [ca.cse(_column(change))])

@@ -80,7 +80,6 @@ class Planner:
         config = (
             self.model.config
             if scale_time
-            # Without scaling the plans are the outputs of the network.
             else replace(self.model.config, time_parametrized=False)
         )
         with loaded_problem(self.model.problem, backend) as loaded:

@@ -143,8 +143,7 @@ class TimeScaling(PhaseGrid):
             scaled = (term / k**order for order, term in enumerate(moving, 1))
             return np.array(self.residuals(p, *scaled, obstacle_poses, *friction)[0])
 
-        # g(k) = static + b / k + c / k^2: three values determine it; powers have a
-        # cubic part and need a fourth.
+        # Three values determine static + b / k + c / k^2; a cubic part needs a fourth.
         fast, slow, static = map(values, (1.0, 2.0, np.inf))
         slowest = values(4.0) if self.bounds.power.any() else static
         needed = np.ones(fast.shape[1])
@@ -166,7 +165,6 @@ class TimeScaling(PhaseGrid):
             scale[power] = _smallest_scale_of_powers(
                 margin[power], change[power], half[power], quarter
             )
-            # A motion needs the scale of its worst row and phase.
             np.maximum.at(needed, phase, scale)
         return needed
 

@@ -367,8 +367,7 @@ def _of_file(
         raise DatasetError(
             f"{path} is of another problem than {problem.name!r}: its problem_sha256 is not this one's"
         )
-    # Parked obstacles of the problem would be planned around in place of those of the
-    # samples.
+    # Parked obstacles would be planned around in place of those of the samples.
     file.check_obstacles(problem)
     boundary = file.boundary(
         open_problem(problem)[1], allow_large_angles=allow_large_angles

@@ -103,8 +103,7 @@ class FineCheck:
             if self._penetration is None
             else self._penetration(task, motion.positions(x))
         )
-        # The excess is above the tolerance: even the smallest counts as a violation,
-        # above 1.
+        # The excess is above the tolerance: even the smallest counts as above 1.
         collision = 1.0 + excess / PENETRATION_SCALE_M if excess > 0 else 0.0
         if max(worst, collision) <= 1:
             return cost, GridViolation(worst, False, 1.0)

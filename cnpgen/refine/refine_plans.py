@@ -192,7 +192,6 @@ def _run(
         quick=len(waiting) <= MAX_SERIAL_PLANS,
     ) as pool:
         count = pool.size
-        # One process reports and records each plan at once.
         size = PLANS_PER_TASK if count > 1 else 1
         parts = (
             waiting[first : first + size] for first in range(0, len(waiting), size)
@@ -202,12 +201,10 @@ def _run(
             pool.distribute(partial(_refine, options=options), tasks, hint=hint)
         ) as results:
             for part, attempts, seconds in results:
-                # CPU time of all workers, shared among them: the elapsed time if all
-                # are busy.
+                # CPU time of all workers, shared among them.
                 watch.computing += seconds / count
                 if journal is not None:
-                    # Recorded before the result is used: a crash afterwards does not
-                    # lose it.
+                    # Recorded before use: a crash afterwards does not lose it.
                     journal.append(part, attempts)
                 yield dict(zip(part, attempts, strict=True))
 

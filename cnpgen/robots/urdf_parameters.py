@@ -215,8 +215,7 @@ def _joint(element: Element) -> UrdfJoint:
     }
     axis = np.array(numbers_in(element.find("axis"), "xyz", (1.0, 0.0, 0.0)))
     length = float(np.linalg.norm(axis))
-    # An axis whose length is 0, or so small that its inverse overflows, cannot be
-    # normalized.
+    # An axis of length 0, or of an infinite inverse length, cannot be normalized.
     if kind in _TURNING_OR_SLIDING and not math.isfinite(
         1 / length if length else math.inf
     ):

@@ -275,7 +275,6 @@ class PuckContact(Constraint):
                 ARC_END_RAD,
                 max(2, math.ceil((tangent - ARC_END_RAD) / ARC_STEP_RAD)),
             )
-            # The hit turned by a quarter turn: both span the plane of the table.
             across = np.array([-hit[1], hit[0]])
             arc = puck - radius * (
                 np.cos(angles)[:, None] * hit + np.sin(angles)[:, None] * across

@@ -82,7 +82,6 @@ def scene_bodies(scenes: Scenes) -> Primitives:
         )
     if len(scenes) == 0:
         raise UsageError("there are no scenes", concerns="scenes")
-    # Scenes of plans and tasks have been validated.
     if isinstance(scenes, Scene):
         return scene_primitives(scenes)
     # Poses in several frames have no common origin without the kinematics of the robot.
