@@ -113,6 +113,7 @@ def page_name(text: str, pages: dict[str, Path]) -> str:
     path = PurePosixPath(text.partition("#")[0].removesuffix(".md"))
     folder = path.parent.name
     name = f"benchmarks/{path.name}" if folder == "benchmarks" else path.name
+    # A folder in front of the name must be that of the page.
     if name not in pages or folder not in {"", "..", pages[name].parent.name}:
         raise UsageError(f"documentation {lacks('page', text, pages)}")
     return name

@@ -84,4 +84,5 @@ def _files(folder: Path) -> Iterator[str]:
 
 
 def _digest(request: object) -> str:
+    # Another version of the package may give another result.
     return canonical_sha256({"cnpgen": __version__, "request": request})

@@ -150,9 +150,11 @@ def _run(words: list[str], given: argparse.Namespace) -> int:
     except SystemExit:
         # --help and --version have printed their text
         return 0
+    # Unknown options are compared with those of the command, if there is one.
     chosen: Parser = getattr(arguments, "parser", parser)
     if extras:
         chosen.refuse(extras)
+    # No command was given.
     if chosen is parser:
         parser.print_help(sys.stderr)
         return 2

@@ -138,6 +138,7 @@ def run(arguments: argparse.Namespace) -> int:
         )
     save_plans(arguments.out, plans)
     record_request(arguments.out, request)
+    # No plans have no mean, which is null in JSON.
     duration = float(plans.duration.mean()) if len(plans) else None
     facts = {
         "file": str(arguments.out),
