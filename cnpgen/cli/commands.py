@@ -18,8 +18,6 @@ _CORE = {  # command -> module of cnpgen.cli, in the order of the help
     "merge": "merge_command",
     "extend": "extend_command",
     "copy": "copy_command",
-    "list": "list_command",
-    "show": "show_command",
     "inspect": "inspect_command",
     "validate": "validate_command",
     "train": "train_command",
@@ -36,6 +34,7 @@ _CORE = {  # command -> module of cnpgen.cli, in the order of the help
 
 def command_names() -> list[str]:
     """List the commands: those of the core in the order of the help, then the others by name."""
+    # A name with a dot is another input of a command: "evaluate.trajectories".
     others = {
         entry.name for entry in addons.installed(COMMANDS) if "." not in entry.name
     }

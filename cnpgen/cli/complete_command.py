@@ -63,6 +63,7 @@ def run(arguments: argparse.Namespace) -> int:
     found = complete(
         arguments.pipeline, arguments.tasks, extrapolate=arguments.extrapolate
     )
+    # No file is written without any answer, and the exit code is 1.
     if len(found.plans):
         save_plans(arguments.out, found.plans)
     if not arguments.quiet:

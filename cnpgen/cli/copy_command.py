@@ -17,7 +17,7 @@ from cnpgen.cli.parser import Parser
 from cnpgen.errors import UsageError
 
 if TYPE_CHECKING:
-    from cnpgen.cli.describe import Recipe
+    from cnpgen.make.any_recipe import Recipe
 
 _NEXT = {
     "dataset": "cnpgen make-dataset {0}",
@@ -41,7 +41,7 @@ def add_options(parser: Parser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> None:
-    from cnpgen.cli.show_command import load_any
+    from cnpgen.make.any_recipe import load_any
     from cnpgen.schema.keys import NAME
     from cnpgen.store.files.atomic import check_writable, write_file
 
@@ -56,6 +56,7 @@ def run(arguments: argparse.Namespace) -> None:
     check_writable(folder)
     for file, text in texts.items():
         write_file(folder / file, text)
+    # The first text is that of the recipe itself, whose references follow.
     first = folder / next(iter(texts))
     print(first)
     print(
@@ -76,6 +77,7 @@ def copied_texts(recipe: "Recipe", name: str) -> dict[str, str]:
         text = _changed(recipe.path, name=name, problem="problem.toml")
         return {"pipeline.toml": text, **copied_texts(recipe.problem, name)}
     files = {"problem.toml": _changed(recipe.path, name=name)}
+    # The URDF of an installed package is found by its address and needs no copy.
     if "://" not in recipe.robot.urdf:  # of a package
         files[recipe.robot.urdf] = recipe.urdf_path.read_text(encoding="utf-8")
     return files

@@ -88,6 +88,7 @@ def list_pages() -> dict[str, Path]:
     # The table above it repeats some links.
     lists = page_text(pages["index"]).partition("## Tutorials")[2]
     for kind in KINDS:
+        # Pages of benchmarks are named with their folder.
         prefix = "benchmarks/" if kind == "benchmarks" else ""
         files = sorted(
             {*(folder / kind).glob("*.md"), *_rendered(kind, folder)},
@@ -108,9 +109,11 @@ def page_name(text: str, pages: dict[str, Path]) -> str:
 
     Raise UsageError for other texts.
     """
+    # A link may end in a heading: "page.md#heading".
     path = PurePosixPath(text.partition("#")[0].removesuffix(".md"))
     folder = path.parent.name
     name = f"benchmarks/{path.name}" if folder == "benchmarks" else path.name
+    # A folder in front of the name must be that of the page.
     if name not in pages or folder not in {"", "..", pages[name].parent.name}:
         raise UsageError(f"documentation {lacks('page', text, pages)}")
     return name
@@ -131,7 +134,9 @@ def mentioned_addresses(text: str) -> list[str]:
 
     None without installed pages or an address of the site.
     """
+    # Help wraps lines, so that the command and the page may be on two of them.
     names = re.findall(r"'cnpgen docs ([\w/-]+)'", " ".join(text.split()))
+    # An error text must not fail because the pages are missing.
     with suppress(CnpgenError):
         pages = list_pages() if names else {}
         named = [pages[name] for name in dict.fromkeys(names) if name in pages]

@@ -69,6 +69,7 @@ def spec_text(
 def row_bytes(spec: DatasetSpec) -> int:
     """Return the size of a row in bytes."""
     return sum(
+        # A field of width 0 has one number per row.
         max(field.width, 1) * storage_dtype(field, spec.dtype).itemsize
         for field in spec.fields
     )
@@ -123,6 +124,7 @@ def _progress(folder: Path, spec: DatasetSpec) -> str:
 def size_text(number: int) -> str:
     """Write a number of bytes: ``"6.7 MB"``."""
     value, units = float(number), ["bytes", "kB", "MB", "GB", "TB"]
+    # Units are decimal: 1 kB = 1000 bytes.
     while value >= 1000 and len(units) > 1:
         value, units = value / 1000, units[1:]
     return f"{value:.3g} {units[0]}" if units[0] != "bytes" else f"{number} bytes"

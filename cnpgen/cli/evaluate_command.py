@@ -85,6 +85,7 @@ def _evaluate(arguments: argparse.Namespace) -> "Evaluation":
         raise UsageError(
             f"{arguments.file} has no plan {arguments.plan}: {len(plans)} plans are numbered from 0"
         )
+    # Without a terminal the summary alone is printed.
     with Meter(quiet=arguments.quiet or not sys.stderr.isatty(), noun="plan") as meter:
         meter.begin(f"judging {arguments.file}", len(plans))
         return evaluate_plans(
@@ -101,6 +102,7 @@ def _write_json(file: Path, found: "Evaluation") -> None:
     from cnpgen.store.files.documents import render
 
     head = render({"file": str(file), **found.summary()})
+    # The document stays open for the verdicts, which follow one by one.
     print(head.removesuffix("\n}") + ',\n  "verdicts": [', end="")
     for index, row in enumerate(found.rows()):
         print(
@@ -133,6 +135,7 @@ def _draw(found: "Evaluation", picture: str, index: int | None) -> None:
 
 def _chosen(found: "Evaluation") -> int:
     """Choose the plan to draw: the first invalid one that can be drawn, else the first that can be drawn."""
+    # A verdict without margins belongs to a plan that could not be evaluated.
     able = [index for index, verdict in enumerate(found.verdicts) if verdict.margins]
     if not able:
         raise DatasetError("none of the plans can be drawn: none can be evaluated")

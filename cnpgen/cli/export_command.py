@@ -90,6 +90,7 @@ def export(
     rate = DEFAULT_RATE_HZ if arguments.rate is None else arguments.rate
     chosen, out = _chosen(plans, arguments), _place(arguments, exporter)
     target = _target(out, exporter)
+    # The result depends on the contents of all files that are read, not on their names.
     request = [
         arguments.to,
         rate,
@@ -126,6 +127,7 @@ def export(
     of_all = (
         f" of {exported.count + len(exported.refused):,}" if exported.refused else ""
     )
+    # A result with plans left out ends with 1 again, so it is no finished one.
     if not exported.refused:
         record_request(target, request)
     print(
@@ -145,6 +147,7 @@ def _plans(arguments: argparse.Namespace) -> "Plans | JoinedPlans":
     if times and len(times) != len(following):
         given = f"--at is given {counted(len(times), 'time')}, --join {counted(len(following), 'time')}"
         raise UsageError(f"{given}: expected one for each")
+    # Without times each plan takes over at the end of the one before.
     for file, time in zip(following, times or [None] * len(following), strict=True):
         plans = join_plans(plans, recipe_names.read_plans(file), at=time)
     return plans
@@ -169,6 +172,7 @@ def _place(arguments: argparse.Namespace, exporter: "Exporter") -> Path:
 
 def _target(out: Path, exporter: "Exporter") -> Path:
     """Return the file or folder that an exporter writes."""
+    # A folder given for a single file gets it with a name of its own.
     inside = exporter.single_file and out.is_dir() and not exporter.is_folder
     return out / f"plans{exporter.suffix}" if inside else out
 

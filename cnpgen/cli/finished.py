@@ -37,9 +37,11 @@ def is_finished(out: Path, request: object, *, force: bool) -> bool:
     if force or not _is_there(out):
         return False
     document = {}
+    # A missing or damaged request is that of no result.
     with suppress(CnpgenError, ValueError):
         content = read_file(request_file(out), max_bytes=MAX_REQUEST_BYTES)
         document = parse_json(content.decode())
+    # The checksum of the result shows whether it was changed since.
     if document == {"request": _digest(request), "result": content_sha256(out)}:
         return True
     raise UsageError(
@@ -85,4 +87,5 @@ def _files(folder: Path) -> Iterator[str]:
 
 
 def _digest(request: object) -> str:
+    # Another version of the package may give another result.
     return canonical_sha256({"cnpgen": __version__, "request": request})

@@ -107,11 +107,13 @@ def _yield_lines(sampling: "SamplingStatistics") -> list[str]:
         ("stage", "rejects because", "draws", "accepts", "left"),
         ("", "", f"{sampling.tried:,}", "", "100.00 %"),
     ]
+    # Candidates that are left: each reason takes its count from those that came to it.
     left, before = sampling.tried, ""
     for reason, count in sampling.rejections.items():
         stage = sampling.stages.get(reason, "")
         accepts = 100 * (1 - count / left) if left else 100.0
         left -= count
+        # A stage with several reasons is named once.
         label = stage if stage != before else ""
         rows.append(
             (
@@ -138,6 +140,7 @@ def _field_rows(
 
     Its name is on the first one, its unit where it is not that of the last.
     """
+    # A column without a name is an empty text; a scalar field has one column.
     columns = field.names or ("",) * max(field.width, 1)
     rows, before = [], ""
     for index, (column, unit) in enumerate(zip(columns, field.units, strict=True)):

@@ -109,6 +109,8 @@ def main(argv: Sequence[str] | None = None) -> int:
 
     Return the exit code.
     """
+    # The namespace exists before parsing, so that an error knows the options read so
+    # far.
     words, given = list(sys.argv[1:] if argv is None else argv), argparse.Namespace()
     prefer_one_thread()
     _prepare_streams()
@@ -116,6 +118,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         try:
             with interruptible():
                 code = _run(words, given)
+            # A closed reader of stdout shows at the latest here, where the error can be
+            # handled.
             sys.stdout.flush()
         except BrokenPipeError:
             return _leave_pipe()
@@ -132,8 +136,11 @@ def _run(words: list[str], given: argparse.Namespace) -> int:
         # Set by the functions of argcomplete in the shell.
         for entry in addons.installed(COMPLETION):
             entry.load()(build_parser())
+    # The parser of one command needs the modules of that command only.
     first = next((word for word in words if not word.startswith("-")), "")
     parser = build_parser([first] if first and is_command(first) else None)
+    # ``before`` is the word in front of each word, that of the first one is the
+    # program.
     for before, word in zip(["cnpgen", *words], words, strict=False):
         if word == "" or re.fullmatch("--[a-z-]+=", word):
             parser.error(
@@ -144,9 +151,11 @@ def _run(words: list[str], given: argparse.Namespace) -> int:
     except SystemExit:
         # --help and --version have printed their text
         return 0
+    # Unknown options are compared with those of the command, if there is one.
     chosen: Parser = getattr(arguments, "parser", parser)
     if extras:
         chosen.refuse(extras)
+    # No command was given.
     if chosen is parser:
         parser.print_help(sys.stderr)
         return 2
@@ -174,6 +183,7 @@ def build_parser(names: Sequence[str] | None = None) -> Parser:
         try:
             module = load_command(name)
         except MachineError as error:
+            # A command that is asked for must work; in a list of all it is only marked.
             if names is not None:
                 raise
             commands.add_parser(name, help=f"cannot be used: {error}")

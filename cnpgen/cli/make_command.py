@@ -154,6 +154,7 @@ def make_metered(
     meter = Meter(quiet=quiet)
 
     def begin(step: str, folder: "Path", rows: int, there: int) -> None:
+        # Libraries may have dropped the interruption; every step raises it again.
         raise_if_interrupted()
         meter.begin(f"{step} {folder}", rows, there)
 
@@ -196,6 +197,7 @@ def _summary(
     if not made.made:
         return [f"{_unmade(made, part)}: {text.rstrip(',')}{rest}"]
     share = "" if made.made == wanted else f"the missing {made.made:,} of "
+    # The time before the last step prepares; a rate needs a time above 0.
     whole, making = meter.seconds, max(meter.running, 1e-9)
     times = f"in {whole:.1f} s: {whole - making:.1f} s to get ready, then {made.made / making:,.0f} rows/s"
     lines = [

@@ -103,12 +103,14 @@ def run(arguments: argparse.Namespace) -> int:
     _complete(arguments)
     model = load_model(arguments.model)
     requests = _requests(arguments, model)
+    # What the result depends on: model, boundary conditions, further columns, options.
     request = [
         content_sha256(find_model(arguments.model)),
         _checksums(requests.boundary.arrays()),
         _checksums({**requests.columns, "sample_id": requests.sample_id}),
         options_of(arguments, "no_time_scaling", "allow_large_angles"),
     ]
+    # With --refine, ``refine_and_save`` compares its own request.
     if not arguments.refine and is_finished(
         arguments.out, request, force=arguments.force
     ):
@@ -136,6 +138,7 @@ def run(arguments: argparse.Namespace) -> int:
         )
     save_plans(arguments.out, plans)
     record_request(arguments.out, request)
+    # No plans have no mean, which is null in JSON.
     duration = float(plans.duration.mean()) if len(plans) else None
     facts = {
         "file": str(arguments.out),

@@ -37,6 +37,7 @@ def check_recipe(recipe: str, *, of_dataset: str = DATASET) -> None:
     path = Path(recipe)
     check_readable(path)
     if path.is_dir():
+        # The name of a shipped recipe counts, also if a folder has the same name.
         if recipe not in _shipped() and is_dataset(path):
             raise UsageError(
                 f"{recipe} is the folder of a dataset, expected a recipe: {of_dataset.format(recipe)}"

@@ -168,6 +168,7 @@ def refine_and_save(
     if is_finished(out, request, force=arguments.force):
         return report_finished(arguments, out)
     check_place(out)
+    # The journal keeps finished plans until the output is complete.
     journal = out.with_name(out.name + ".part")
     finished = [0, 0]
 
@@ -178,6 +179,7 @@ def refine_and_save(
 
     run: Callable[..., Refinement | SolvedScenes] = make or refine_plans
     with resumable(journal), Meter(quiet=arguments.quiet, noun="plan") as meter:
+        # ``discard`` applies to the journal of another request.
         found = run(
             plans,
             options=options,
@@ -194,6 +196,7 @@ def refine_and_save(
             _explain(facts, found, meter)
     save_plans(out, found.plans)
     record_request(out, request)
+    # The journal is removed last: until then the same command can resume from it.
     journal.unlink(missing_ok=True)
     if not arguments.quiet:
         lines = _summary(
@@ -220,6 +223,7 @@ def check_free(out: Path, *, force: bool, unless_finished: bool = False) -> None
     """
     from cnpgen.cli.finished import request_file
 
+    # A result of an earlier request is compared later, when this request is known.
     is_result = unless_finished and out.suffix == ".h5" and request_file(out).exists()
     if out.is_file() and not force and not is_result:
         raise UsageError(f"{out} exists: --force replaces it, -o names another file")

@@ -142,6 +142,7 @@ def _solve_scenes(arguments: argparse.Namespace, out: Path) -> int:
     record, initial = record_problem(problem), None
     if arguments.initial_plans is not None:
         initial = recipe_names.read_plans(arguments.initial_plans, problem=None)
+    # What the result depends on; parts that are absent leave earlier requests equal.
     request = [
         # With the meshes, which other files may hold.
         joblib.hash(scenes),
@@ -152,6 +153,7 @@ def _solve_scenes(arguments: argparse.Namespace, out: Path) -> int:
     ]
 
     def solve(_: "Plans", **options: Any) -> "SolvedScenes":
+        # Some options belong to the run as a whole, the others to the solver.
         names = options.keys() & {"engine", "address", "begin"}
         own = {name: options.pop(name) for name in names}
         run = SceneOptions(

@@ -96,6 +96,7 @@ class Meter:
         """Show the start of a step with ``total`` samples, of which ``initial`` exist; the previous step is over."""
         self.close()
         self.rows, self.sampling, self._begun = 0, None, time.perf_counter()
+        # A terminal has a bar that moves; a file or a pipe gets one line per step.
         if not self._quiet and sys.stderr.isatty():
             from tqdm import tqdm
 
@@ -137,6 +138,7 @@ class Meter:
         if self._bar is not None:
             if self.sampling is not None:
                 tried = self._bar.format_sizeof(self.sampling.tried)
+                # The number of draws may be 0 at the start.
                 share = self.sampling.accepted / max(self.sampling.tried, 1)
                 self._bar.set_postfix_str(
                     f"{tried} tried, {share:.1%} accepted", refresh=False
@@ -178,6 +180,7 @@ def table(
     widths = [
         max(len(row[column]) for row in rows) for column in range(len(rows[0]) - 1)
     ]
+    # Further lines of the last column begin below its first one: two spaces per column.
     hanging = indent + " " * (sum(widths) + 2 * len(widths))
     space, count = max(width - len(hanging), 30), 1 if one_line else None
     wrapper = TextWrapper(

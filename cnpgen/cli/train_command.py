@@ -112,6 +112,7 @@ class Watch:
                 f"every step takes all {taken:,} rows: there are no {wanted:,} for a batch",
                 file=sys.stderr,
             )
+        # Passes = steps * rows per step / rows of the data set.
         passes = steps * taken / len(run.rows)
         if passes > OFTEN and not self._quiet:
             print(
@@ -174,6 +175,7 @@ def _train(arguments: argparse.Namespace, watch: Watch) -> "Trained":
     from cnpgen.training.training_options import TrainingOptions
 
     preset, length = PRESETS.get(arguments.preset), options_of(arguments, *_LENGTHS)
+    # A length that is given replaces that of the preset as a whole.
     if preset is not None and all(value is None for value in length.values()):
         length = dict(vars(preset.length))
     options = TrainingOptions(

@@ -134,6 +134,7 @@ def changed_settings(
         for name, value in options_of(arguments, *_OPTIONS).items()
         if value is not None
     }
+    # Options of the metric change that of ``--metric``, or else that of the preset.
     metric = settings.metric if arguments.metric is None else METRICS[arguments.metric]
     passed = {
         name: value
@@ -141,6 +142,8 @@ def changed_settings(
         if value is not None
     }
     for name in passed:
+        # Weights of a ramped metric grow, without learning; those of a fixed one do
+        # neither.
         if metric.kind == "fixed" or (metric.kind == "ramped" and name != "growth"):
             reason = (
                 "whose weights do not grow"
@@ -174,6 +177,7 @@ def _margin(text: str) -> tuple[str, float]:
     try:
         number = float(factor)
     except ValueError:
+        # Text that is no number is refused with the numbers out of range.
         number = -1.0
     if not sign or not term or not 0 < number <= 1:
         raise argparse.ArgumentTypeError(

@@ -47,6 +47,7 @@ def run(arguments: argparse.Namespace) -> int:
 
     options = options_of(arguments, "deep", "regenerate", *ENGINE)
     with Meter(quiet=arguments.quiet) as meter:
+        # Only --deep reads samples, which the bar counts.
         if rows := _rows(arguments.folder) if arguments.deep else 0:
             meter.begin(f"validating {arguments.folder}", rows)
             options["progress"] = meter

@@ -27,6 +27,7 @@ def whole(text: str) -> int:
     """
     if len(text) <= _MAX_DIGITS and _WHOLE.fullmatch(text):
         number = Decimal(text)
+        # A decimal number is exact: 1.5e3 is whole and 1.55e1 is not.
         if number == number.to_integral_value():
             return int(number)
     raise ValueError(f"no whole number: {text[:_MAX_DIGITS]!r}")
@@ -42,6 +43,7 @@ def _whole_in_range(
     try:
         number = whole(text)
     except ValueError:
+        # A number below the range leads to the same error as a text that is none.
         number = low - 1
     if number < low:
         raise ArgumentTypeError(
@@ -70,6 +72,8 @@ def part(text: str) -> tuple[int, int]:
     try:
         k, m = (whole(number) for number in text.split("/"))
     except ValueError:
+        # No part is valid with these numbers, so that the text below describes the
+        # error.
         k, m = 0, 0
     if not 0 <= k < m:
         raise ArgumentTypeError(
@@ -125,6 +129,7 @@ plot_file = file_in(".png", ".pdf", ".svg")
 def seconds_with_unit(text: str) -> float:
     """Read a time above 0 with its unit, where a number alone is probably meant in another one: ``10ms``."""
     time = seconds(text)
+    # The number ends without a letter: it has no unit.
     if text.strip()[-1:].isdigit() or text.strip().endswith("."):
         text = f"expected a time with its unit, such as 10ms; got {text!r}, is it {text}ms or {text}s?"
         raise ArgumentTypeError(text)
@@ -138,6 +143,7 @@ def _quantity(unit: str, expected: str, text: str) -> float:
     try:
         number = parse_number(text, unit)
     except ValueError as error:
+        # Some errors say themselves what is expected.
         more = "" if str(error).startswith("expected") else f": {error}"
         raise ArgumentTypeError(f"expected {expected}; got {text!r}{more}") from error
     if number <= 0:
@@ -162,6 +168,7 @@ def positions(text: str) -> tuple[float, ...]:
     try:
         found = tuple(float(item) for item in text.split(","))
     except ValueError:
+        # A text that is no number is refused with the numbers that are not finite.
         found = (math.nan,)
     if not all(map(math.isfinite, found)):
         raise ArgumentTypeError(
@@ -175,6 +182,7 @@ def numbers(text: str) -> tuple[int, ...]:
     found: list[int] = []
     for item in text.split(","):
         ends = re.fullmatch(r"\s*(-?[0-9]+)\s*(?:-\s*([0-9]+))?\s*", item[:_MAX_DIGITS])
+        # Text that does not match gets an empty range, which is refused.
         low, high = (int(ends[1]), int(ends[2] or ends[1])) if ends else (1, 0)
         if not low <= high < low + MAX_SELECTED:
             raise ArgumentTypeError(
@@ -227,10 +235,13 @@ def tracking_errors(text: str) -> float | tuple[float, ...]:
 
     found = []
     for part in text.split(","):
+        # The joint of a number is not known here, so its unit may be that of either
+        # kind.
         for unit in ("rad", "m"):
             with suppress(ValueError):
                 found.append(parse_number(part.strip(), unit))
                 break
+    # A part that has neither unit is missing in the list.
     if len(found) != text.count(",") + 1 or not all(
         0 <= value < math.inf for value in found
     ):

@@ -174,6 +174,7 @@ def margin_head(*first: str, item: str) -> tuple[str, ...]:
 def margin_cells(margin: Mapping[str, Any], index: int) -> tuple[str, ...]:
     """Format a margin, or the violation in its place, with tolerance, unit, index, time and place as cells of a table."""
     violation = margin["violation"]
+    # A violation of 0 or less is a margin.
     holds = violation is not None and violation <= 0
     at = "-" if margin["time"] is None else f"{margin['time']:.4f}"
     return (

@@ -130,6 +130,7 @@ def _read(key: str, cache_folder: Path) -> bytes | None:
         with suppress(OSError):
             content = path.read_bytes() if is_trusted(path) else b""
             code = content[DIGEST_BYTES:]
+            # The checksum comes before the code; see ``store``.
             if code and hashlib.sha256(code).digest() == content[:DIGEST_BYTES]:
                 return code
     return None

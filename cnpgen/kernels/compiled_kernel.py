@@ -132,6 +132,7 @@ def _load_call(cache_folder: Path) -> Any:
     for name in PYTHON_FUNCTIONS:
         define_symbol(name, getattr(ctypes.pythonapi, name))
     code = make_final(content_key(CALL.encode()), CALL, cache_folder)
+    # Such a function keeps Python's lock, which calls of Python's C API need.
     kind = ctypes.PYFUNCTYPE(
         ctypes.c_int, ctypes.POINTER(_Callee), ctypes.py_object, ctypes.py_object
     )
@@ -173,6 +174,8 @@ def _array_type(kind: Any, count: int) -> Any:
 def aligned_array(count: int) -> Array:
     """Return an uninitialized array of ``count`` float64 values, aligned to a cache line and so to any vector."""
     memory = np.empty(count + CACHE_LINE_DOUBLES)
+    # Skip o elements of 8 bytes: o = (-address / 8) mod 8 ends at a multiple of 64
+    # bytes.
     return memory[-address_of(memory) // memory.itemsize % CACHE_LINE_DOUBLES :][:count]
 
 

@@ -176,6 +176,8 @@ def _outputs(
 
 def _kill(process: "subprocess.Popen[str]") -> None:
     with suppress(ProcessLookupError):
+        # The compiler leads a process group of its own, which contains its child
+        # processes.
         os.killpg(process.pid, signal.SIGKILL)
 
 
@@ -204,6 +206,8 @@ def run_compiler(
         MachineError: The compiler fails, or takes too long for the size of the source.
     """
     options = [*COMPILER_FLAGS, *flags, str(source), "-o", str(built), "-lm"]
+    # The limit grows with the size of the source, between that of the smallest and
+    # largest.
     seconds = min(
         MIN_COMPILE_LIMIT_S + round(LIMIT_S_PER_BYTE * source.stat().st_size),
         MAX_COMPILE_TIME_S,
@@ -211,6 +215,7 @@ def run_compiler(
     completed = _run(compiler, options, seconds, f"for {source.name}")
     if completed.returncode != 0 or not built.exists():
         errors = completed.stderr
+        # The first line about an error, or else the beginning of the output.
         first = next(
             (line for line in errors.splitlines() if "error" in line),
             errors.strip()[:200],

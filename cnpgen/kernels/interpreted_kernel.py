@@ -92,11 +92,13 @@ class _BlockProgram:
         self, arguments: Sequence[Array], out: Sequence[Array], k: int, n: int
     ) -> None:
         """Evaluate all points of K nodes and N lanes, a few nodes at a time."""
+        # Nodes of a block: as many as fit into it with all lanes, at least one.
         count = max(POINTS_PER_BLOCK // max(n, 1), 1)
         work = np.empty(
             (self._slots, min(count, k), min(n, POINTS_PER_BLOCK)), self._dtype
         )
         block = _LaneBlock(self._program, list(work))
+        # Values inf and nan are results like others, as in machine code.
         with np.errstate(all="ignore"):
             for node in range(0, k, count):
                 for lane in range(0, n, POINTS_PER_BLOCK):
@@ -105,6 +107,8 @@ class _BlockProgram:
                         slice(lane, min(lane + POINTS_PER_BLOCK, n)),
                     )
                     shape = nodes.stop - node, lanes.stop - lane
+                    # The last block along an axis is smaller; it works on parts of the
+                    # same rows.
                     if shape != block.rows[0].shape:
                         block = _LaneBlock(
                             self._program, [row[: shape[0], : shape[1]] for row in work]
@@ -136,6 +140,7 @@ class _BlockProgram:
                 out[result][component, nodes, lanes] = value
             else:
                 shape = (nodes.stop - nodes.start, lanes.stop - lanes.start)
+                # A result without a node axis is the sum over the nodes.
                 out[result][component, lanes] += np.broadcast_to(value, shape).sum(
                     axis=0
                 )
@@ -188,6 +193,7 @@ def _allocate(tape: Tape) -> tuple[int, list[Step]]:
         tape.b.tolist(),
         tape.constant.tolist(),
     )
+    # Last instruction that reads each value; 0 for none, as number 0 reads none.
     last = np.zeros(len(tape), int)
     for k, (code, a, b, _) in enumerate(zip(*columns, strict=True)):
         last[[a, b][: OPERATIONS[NAMES[code]]]] = k
@@ -205,6 +211,7 @@ def _allocate(tape: Tape) -> tuple[int, list[Step]]:
         operands = (a, b)[: OPERATIONS[name]]
         places = tuple(place[operand] for operand in operands)
         dying = {operand for operand in operands if last[operand] == k}
+        # A result may take the row of an operand, since operations are elementwise.
         free.extend(
             place[operand] for operand in dying if isinstance(place[operand], int)
         )

@@ -89,6 +89,8 @@ def evaluate_lanes(
             inputs = [np.ascontiguousarray(x[:, active]) for x in inputs]
         next_state, next_error = evaluate(inputs, len(active))
         state[:, active], error[:, active] = next_state, next_error
+        # A comparison with nan is false: a lane with the error nan stays active to the
+        # limit.
         active = active[~(next_error[0] < tape.loop.tolerance)]
     return [state, error]
 
@@ -167,6 +169,7 @@ def check_grid(
         zip(arrays, (*tape.inputs, *tape.outputs), map(axis_names, axes), strict=True)
     ):
         shape = (width, *(size[name] for name in names))
+        # A row of one element has no distance of lanes.
         rows = (
             "lanes" not in names
             or size["lanes"] == 1

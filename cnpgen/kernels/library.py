@@ -199,13 +199,17 @@ def _source_digests(builder: Callable[..., Any]) -> list[str]:
     import anything: the digests cover this package and the plug-in's.
     """
     module = builder.__module__
+    # A builder of another distribution depends on all of this package and on its own
+    # one.
     if module.partition(".")[0] != "cnpgen":
         return [_digest_of(PACKAGE_FOLDER), package_digest(module.partition(".")[0])]
+    # A builder of an add-on may use any module of the package.
     if addons.addon_of(module):
         return [_digest_of(PACKAGE_FOLDER)]
     shared = (PACKAGE_FOLDER / name for name in BUILDER_PACKAGES)
     own = subpackage_of(module)
     digests = [_digest_of(*shared), _digest_of(PACKAGE_FOLDER / own)]
+    # Losses also depend on published rules, which other packages may install.
     return digests + _rules_digests() if own == "losses" else digests
 
 

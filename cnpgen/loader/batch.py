@@ -66,6 +66,8 @@ class Batch(Mapping[str, NDArray[Any]]):
         if name in self.integers:
             return self.integers[name]
         part = self.layout.slices[name]
+        # A column of a scalar field, shape (B,), or the columns of a vector, (B,
+        # width).
         return self.table[:, part.start if name in self.layout.scalars else part]
 
     def __iter__(self) -> Iterator[str]:
@@ -92,6 +94,8 @@ class BatchObserver:
 
     def __call__(self, batch: Batch) -> dict[str, NDArray[Any]]:
         """Observe the scenes of a batch."""
+        # Points depend on the content of the batch: equal batches are observed equally,
+        # others differently.
         seed = ((self.seed << 32) + zlib.crc32(batch.table.tobytes())) % MAX_SEED
         return observe(self.scenes(batch), self.kind, seed=seed)
 

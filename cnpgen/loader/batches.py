@@ -65,6 +65,8 @@ class BatchPartition:
 
     def end(self, rows: int, *, first: int = 0) -> int:
         """Return the end of the batches that start at position ``first``, of ``rows`` rows."""
+        # The remainder of the last batch is dropped, counted from the position where
+        # reading begins.
         return rows - (rows - first) % self.batch_size if self.drop_last else rows
 
     def check_ranks(self, rows: int, *, first: int = 0) -> None:
@@ -83,6 +85,8 @@ class BatchPartition:
     def count(self, rows: int) -> int:
         """Return the number of batches of this worker for ``rows`` rows."""
         batches = -(-self.end(rows) // self.batch_size)
+        # Worker w has the batches w, w + W, w + 2 W, ...: ceil((batches - w) / W) of
+        # them.
         return -(-(batches - self.worker) // self.workers)
 
 
@@ -185,6 +189,7 @@ class Batches:
         self.worker_positions: Any = None
 
     def __getstate__(self) -> dict[str, Any]:
+        # Rows are read again in the other process; shared positions belong to this one.
         return self.__dict__ | {"_in_memory": None, "worker_positions": None}
 
     def __repr__(self) -> str:
@@ -242,6 +247,8 @@ class Batches:
                 world=partition.world,
             )
             row = min(row + partition.workers * partition.batch_size, end)
+            # The position moves before the batch is returned: a state that is saved
+            # within the loop continues after it.
             self._position = position = self._forward(
                 Position(begin.seed, begin.shuffle, begin.epoch, row)
             )
@@ -250,6 +257,7 @@ class Batches:
                 if self._observe is None
                 else replace(batch, observations=self._observe(batch))
             )
+            # Another object in its place was set by other code during the yield.
             if self._position is not position:
                 raise UsageError(
                     "within this loop, another loop over the same batches ran or load_state was called"
@@ -289,6 +297,7 @@ class Batches:
             if used > len(self):
                 text = f"must be at most {len(self)}, the number of batches of an epoch, got {used}"
                 raise UsageError(text, argument="batch")
+            # The number of used batches determines the position on all ranks.
             row = min(used * self._partition.batch_size, self._source.rows)
             epoch = (
                 position.epoch if epoch is None else integer("epoch", epoch, least=0)

@@ -35,6 +35,7 @@ def gather(source: SplitShards, indices: ArrayLike, layout: Columns) -> Rows:
     }
     for shard, positions, local in _by_shard(rows, source):
         file = source.shards[shard]
+        # The whole file is read if it has few rows per required one.
         dense = MAX_READ_ROWS_PER_ROW * len(local) >= file.rows
         stored = (source.reader.read if dense else source.reader.map)(
             file, layout.fields
@@ -60,6 +61,7 @@ def _checked(indices: ArrayLike, source: SplitShards) -> Indices:
             f"must be a list of integers, got {rows.dtype} of shape {rows.shape}",
             argument="indices",
         )
+    # As of lists, negative indices count from the end.
     wrong = (rows < -source.rows) | (rows >= source.rows)
     if wrong.any():
         text = f"split {source.split!r} has {source.rows} rows, there is no row {rows[wrong][0]}"
@@ -72,7 +74,9 @@ def _by_shard(
 ) -> Iterator[tuple[int, Indices, Indices]]:
     """Yield every required shard: its index, the positions of its rows in the result, and the rows within it."""
     ends = np.cumsum([shard.rows for shard in source.shards])
+    # The shard whose end is the first above the row.
     shards = np.searchsorted(ends, rows, side="right")
+    # Rows are grouped by shard, so that each file is opened once.
     order = np.argsort(shards, kind="stable")
     for positions in np.split(order, np.flatnonzero(np.diff(shards[order])) + 1):
         if len(positions):

@@ -58,6 +58,7 @@ def load_dataset(
     stored = replace(stored, folder=folder)
     if stored.manifest is None:
         summary = summarize_dataset(folder, stored.spec, allow_incomplete=True)
+        # Without a manifest the sidecars are the only records.
         statistics, made = summary.statistics, summary.records
         recorded = [
             Shard(folder, stored.spec, task, record.bytes, record.sha256)
@@ -72,6 +73,7 @@ def load_dataset(
     }
     _check_rows(stored.spec, recorded)
     present = _present(folder, listed, allow_incomplete=allow_incomplete)
+    # Only of the shards that exist, since a loader's state must belong to these rows.
     fingerprint = data_fingerprint(
         (shard.path.relative_to(folder).as_posix(), shard.sha256)
         for part in present.values()
@@ -106,6 +108,7 @@ def _load_statistics(folder: Path, spec: DatasetSpec) -> Statistics:
 
 def _check_rows(spec: DatasetSpec, shards: Iterable[Shard]) -> None:
     """Raise an error, before memory is allocated, if shards are too small for their recorded number of rows."""
+    # Bytes of a row.
     width = sum(
         max(field.width, 1) * storage_dtype(field, spec.dtype).itemsize
         for field in spec.fields

@@ -42,6 +42,7 @@ class Normalization:
     def scale(self) -> dict[str, Floats]:
         """Field name -> 1 / std, 0 for constant columns, shape (c,)."""
         return {
+            # A constant column becomes 0 instead of 0 / 0.
             name: np.divide(1.0, std, out=np.zeros_like(std), where=std > 0)
             for name, std in self.std.items()
         }
@@ -106,6 +107,7 @@ class Normalization:
             np.empty(0),
             {field.name: max(field.width, 1) for field in fields},
         )
+        # Fields of scenes have mean 0 and scale 1, which leaves them as they are.
         mean = [self.mean.get(name, np.zeros(count)) for name, count in width.items()]
         scale = [self.scale.get(name, np.ones(count)) for name, count in width.items()]
         return np.concatenate([empty, *mean]), np.concatenate([empty, *scale])
@@ -202,6 +204,8 @@ def select_columns(spec: DatasetSpec, names: Iterable[str] | None) -> Columns:
             tuple(
                 field
                 for field in spec.fields
+                # By default those that a model uses: diagnostics describe how a sample
+                # was made.
                 if field.dtype == "float" and field.role != "diagnostic"
             )
         )

@@ -88,6 +88,7 @@ class SceneColumn:
     def __getitem__(self, rows: Any) -> NDArray[Any]:
         """Return the values of rows, shape (k, width) or (k,)."""
         index = self.index[rows]
+        # Poses are computed once for each scene of the rows.
         scenes, place = np.unique(index, return_inverse=True)
         chosen = self.table[scenes]
         if self.name == OBSTACLE_POSES:
@@ -115,6 +116,7 @@ class ShardReader:
         self._maps: dict[Path, mmap.mmap] = {}
 
     def __getstate__(self) -> dict[str, Any]:
+        # Maps cannot be pickled, and scenes are read again.
         return self.__dict__ | {"_maps": {}, "_scenes": None}
 
     def read(self, shard: Shard, fields: Sequence[Field]) -> Rows:
@@ -127,6 +129,7 @@ class ShardReader:
             for name, column in self._scene_columns(shard, of_scenes).items()
         }
         checked = self._checked.setdefault(shard.path, {})
+        # Values are checked at the first reading only.
         stored = {field.name for field in fields} - checked.keys()
         check_values(shard, {name: columns[name] for name in stored})
         checked.update((field.name, field) for field in fields)
@@ -148,6 +151,8 @@ class ShardReader:
         mapped = None
         checked = self._checked.get(shard.path, {}).keys() >= selected.keys()
         if checked and all(
+            # A view of the file needs contiguous numbers in the byte order of the
+            # machine.
             place.offset is not None and place.dtype.isnative
             for place in selected.values()
         ):

@@ -59,6 +59,7 @@ class Order:
     def windows(self) -> tuple[Window, ...]:
         """The windows of the epoch, in order."""
         shards = self._permuted(len(self.shard_rows), stage=0)
+        # Windows of about WINDOW_ROWS rows, at least one shard each.
         count = min(
             max(round(sum(self.shard_rows) / WINDOW_ROWS), 1), max(len(shards), 1)
         )
@@ -71,11 +72,13 @@ class Order:
 
     def rows_of(self, window: int) -> NDArray[np.int64]:
         """Return the order of the rows of a window: indices into the concatenated rows of its shards, shape (rows,)."""
+        # Stage 0 is the order of the shards.
         return self._permuted(self.windows[window].rows, stage=1 + window)
 
     def _permuted(self, size: int, *, stage: int) -> NDArray[np.int64]:
         if not self.shuffle:
             return np.arange(size)
+        # The name of the split as eight words: splits have independent orders.
         words = np.frombuffer(
             hashlib.sha256(self.split.encode()).digest(), "<u4"
         ).tolist()
@@ -91,6 +94,7 @@ def permutation(size: int, *, seed: int, key: tuple[int, ...]) -> NDArray[np.int
     so ties are negligible. Seed and key are not negative.
     """
     raw = np.random.SFC64(np.random.SeedSequence(seed, spawn_key=key)).random_raw(size)
+    # As many low bits as the largest index needs.
     mask = np.uint64((1 << max(size - 1, 1).bit_length()) - 1)
     keys = (raw & ~mask) | np.arange(size, dtype=np.uint64)
     keys.sort()
@@ -159,8 +163,10 @@ def _fill(
 ) -> None:
     """Copy columns side by side in chunks, so that the float64 arithmetic stays in the cache."""
     rows, width = table.shape
+    # Rows of a chunk whose float64 values stay in the cache.
     step = min(max(_CHUNK_VALUES // width, 1), rows)
     buffer = np.empty((step, width))
+    # Repeated for all rows of a chunk, so that no operation broadcasts.
     scales: Sequence[NDArray[np.float64]] = (
         () if scaling is None else [np.tile(part, (step, 1)) for part in scaling]
     )
@@ -170,12 +176,14 @@ def _fill(
     ]
     for first in range(0, rows, step):
         last = min(first + step, rows)
+        # The last chunk is shorter.
         if last - first < step:
             buffer, *scales = (part[: last - first] for part in (buffer, *scales))
             copies = [(target[: last - first], values) for target, values in copies]
         for target, values in copies:
             np.copyto(target, values[first:last])
         if scales:
+            # (x - mean) / std
             np.subtract(buffer, scales[0], out=buffer)
             np.multiply(buffer, scales[1], out=buffer)
         table[first:last] = buffer
@@ -355,6 +363,7 @@ class Windows:
         window, rows = self._order.windows[index], self._order.rows_of(index)
         if self._in_memory is not None:
             return self._in_memory.packed, self._in_memory.load(window.shards)[rows]
+        # Windows alternate between two buffers: one is read while the other is filled.
         if index % 2 not in self._memory:
             self._memory[index % 2] = empty_packed(
                 max(other.rows for other in self._order.windows), self._row_format

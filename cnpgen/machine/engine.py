@@ -105,6 +105,7 @@ class Engine:
                 f"expected one of {', '.join(known)}{hint}",
                 concerns="engine",
             )
+        # The address is checked before any work, since connecting may take long.
         if self.name is not None and self.is_cluster:
             engine = cluster_engine(self.name)
             if self.address is not None:

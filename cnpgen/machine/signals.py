@@ -55,6 +55,7 @@ def signals_handled(
         if not received.came:
             received.number, received.since = number, time.monotonic()
             first(number)
+        # Earlier repetitions are the same keystroke.
         elif time.monotonic() - received.since > MIN_REPEAT_INTERVAL_S:
             again(number)
 
@@ -77,6 +78,7 @@ def signals_deferred() -> Iterator[Received]:
     before, waiting = _handlers(), Received()
 
     def effect(number: int) -> None:
+        # The second signal has its usual effect at once.
         waiting.number = None
         signal.signal(number, before[number])
         signal.raise_signal(number)
@@ -91,11 +93,14 @@ def signals_deferred() -> Iterator[Received]:
 
 def _handlers() -> dict[int, Any]:
     """Return the replaceable handlers: signal number -> handler."""
+    # Python sets handlers in the main thread only.
     if threading.current_thread() is not threading.main_thread():
         return {}
     found = {int(number): signal.getsignal(number) for number in NUMBERS}
     return {
         number: handler
         for number, handler in found.items()
+        # Ignored signals stay ignored, as under nohup; None is a handler of C that
+        # cannot be restored.
         if handler not in (signal.SIG_IGN, None)
     }

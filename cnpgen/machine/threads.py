@@ -48,6 +48,8 @@ class _Limit:
 
     def enter(self, libraries: Sequence[_Library]) -> None:
         """Increment the count; set the limit on the first entry."""
+        # Blocks may be nested and run in several threads: only the outermost changes
+        # the libraries.
         if self._inside == 0:
             found = (
                 (set_threads, get_threads()) for get_threads, set_threads in libraries
@@ -116,6 +118,7 @@ def _libraries() -> tuple[list[_Library], list[_Library]]:
     shared: list[_Library] = []
     own: list[_Library] = []
     for library in found:
+        # OpenMP keeps the number of threads per thread of the caller.
         is_own = getattr(library, "threading_layer", "") == "openmp"
         (own if is_own else shared).append(_functions(library))
     return shared, own

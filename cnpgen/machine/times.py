@@ -77,4 +77,6 @@ class Stopwatch:
     def times(self) -> Times:
         """Return the times until now."""
         left = time.perf_counter() - self.begun - self.preparing
+        # Elapsed time after the preparation that was not computing; the clocks of CPU
+        # and wall may differ slightly.
         return Times(self.preparing, self.computing, max(left - self.computing, 0.0))

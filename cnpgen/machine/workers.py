@@ -75,6 +75,8 @@ def distribute(
     backend, _ = get_active_backend()
     name = type(backend).__name__
     try:
+        # Order: processes that end with this one, backends that yield results, and
+        # those that take lists.
         if name == "LokyBackend":
             yield from _on_processes(function, tasks, workers, ordered=ordered)
         elif backend.supports_return_generator or name == "SequentialBackend":
@@ -157,9 +159,12 @@ def _packed(function: Callable[[T], R], folder: str, task: T) -> bytes | str:
     try:
         outcome = True, function(task)
     except Exception as error:  # noqa: BLE001 - raised again in the parent process
+        # The trace of the worker would be lost by pickling.
         error.add_note(traceback.format_exc())
         outcome = False, error
     message = bytes(dumps(outcome))
+    # Such messages are written at once: a worker that is killed leaves no part of one
+    # in the pipe.
     if len(message) <= MAX_PIPE_BYTES:
         return message
     path = Path(folder) / uuid.uuid4().hex
@@ -248,6 +253,7 @@ def _tolerate_aborts() -> None:
 
     @wraps(dispatch)
     def dispatch_remaining(thread: Any) -> None:
+        # The task was removed by the abort and needs no dispatch.
         with suppress(KeyError):
             dispatch(thread)
 
@@ -261,6 +267,7 @@ def _end_with(parent: int) -> None:
     """
 
     def watch() -> None:
+        # An orphan gets another parent.
         while os.getppid() == parent:
             time.sleep(PARENT_POLL_INTERVAL_S)
         os._exit(1)

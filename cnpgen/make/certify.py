@@ -113,6 +113,7 @@ class CertifiedPlan(Stage):
 
         def work(candidates: CandidateBatch, _random: np.random.Generator) -> None:
             columns = {
+                # Stages hold columns with the rows last, solvers rows first.
                 name: np.ascontiguousarray(values.T)
                 for name, values in candidates.columns.items()
             }
@@ -125,6 +126,8 @@ class CertifiedPlan(Stage):
                 guess = planner.plan_batch(
                     planner_boundary(columns, planner), columns=poses
                 ).motion
+            # Workers are processes already: threads of linear algebra would compete for
+            # their cores.
             with one_thread():
                 motion, valid = (
                     solver(columns, guess)
@@ -190,6 +193,7 @@ class SceneSolver:
         )
         path = np.empty((count, spec.path_control_points, robot.n))
         rate, valid = np.empty((count, spec.rate_control_points)), np.zeros(count, bool)
+        # Number of obstacles of each kind in each scene, shape (N, kinds).
         numbers = np.stack(
             [
                 (scenes.obstacle_kind == code).sum(axis=1)
@@ -197,9 +201,11 @@ class SceneSolver:
             ],
             axis=1,
         )
+        # Rounded up to multiples, but no more places than the problem has.
         numbers = np.minimum(
             -(-numbers // PLACES_PER_STEP) * PLACES_PER_STEP, self._capacity
         )
+        # Scenes with equal numbers of places share a solver.
         groups, group_of = np.unique(numbers, axis=0, return_inverse=True)
         for index, group in enumerate(groups.tolist()):
             rows = np.flatnonzero(group_of.ravel() == index)
@@ -218,6 +224,7 @@ class SceneSolver:
                 sample_obstacles(self._context.problem.obstacle),
             )
             kept = zip(OBSTACLE_KINDS, counts, strict=True)
+            # The first places of each kind are kept, where scene_poses puts obstacles.
             removed = {index for kind, count in kept for index in places[kind][count:]}
             obstacles = [
                 each

@@ -149,6 +149,8 @@ def _completed(
     extrapolate: bool,
     columns: Mapping[str, ArrayLike],
 ) -> Completed:
+    # Wider ranges are another problem, whose kernels and checks must be those of the
+    # tasks.
     if extrapolate and "parameters" in columns:
         wider = extrapolated(pipeline.problem, columns["parameters"])
         pipeline = replace(pipeline, problem=wider)
@@ -196,6 +198,7 @@ def _given(
     given = {
         name: _rows(fields[name], values, flat=flat) for name, values in columns.items()
     }
+    # One row holds for all tasks.
     count = max(map(len, given.values()))
     for name, values in given.items():
         if len(values) not in {1, count}:
@@ -213,6 +216,7 @@ def _rows(field: Field, values: ArrayLike, *, flat: bool) -> Array:
     On a table (``flat``) the z of a position is optional.
     """
     array, width = numbers(field.name, values), max(field.width, 1)
+    # On a table the height follows from the problem.
     widths = {width, 2} if flat and field.name.endswith("_xyz") else {width}
     if not field.width:
         array = array[..., None]
@@ -272,6 +276,7 @@ def read_tasks(
             raise DatasetError(
                 f"{path}: {name} must be a finite number in every task, got {values[row]} in task {row}"
             )
+    # Tables of HDF5 have whole fields, CSV tables one column per component.
     found = {name: values for name, values in columns.items() if name in fields}
     for field in fields.values():
         parts = [

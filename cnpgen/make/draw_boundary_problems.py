@@ -47,6 +47,8 @@ def draw_boundary_problems(
     check_memory("n", n, n * sum(max(field.width, 1) for field in prepared.fields))
     root = loaded.seed if root is None else root
     blocks = [
+        # The random numbers of a block depend on seed, split and index: n does not
+        # change the first rows.
         prepared.block(root, SPLIT, index, first=0, stop=min(n - index * rows, rows))
         for index in range(-(-n // rows))
     ]

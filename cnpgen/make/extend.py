@@ -69,6 +69,7 @@ def extend_dataset(
     where, n = Engine(engine, address, workers), integer("n", n, least=1, most=MAX_ROWS)
     folder = require_dataset(folder)
     begun = _begun(folder)
+    # The recipe comes from the dataset itself: its file may have changed or be missing.
     with restored(begun) as recipe:
         extended = _extended(folder, begun, recipe, n)
         backend, cache_folder = choose_backend(begun.backend)
@@ -78,6 +79,8 @@ def extend_dataset(
             check_writable(folder)
             # Raises errors of this machine before anything is written.
             prepare(job)
+            # The manifest goes first, so that the dataset counts as unfinished from the
+            # new specification on.
             delete_shards(folder, ())
             write_dataset_spec(folder, extended)
         remove_leftovers(folder / WORK)
@@ -100,6 +103,7 @@ def _extended(
     splits = split_rows(recipe, n)
     if splits == begun.splits:
         return begun
+    # Rows are never removed.
     if any(splits.get(split, 0) < rows for split, rows in begun.splits.items()):
         text = f"{folder} has {sum(begun.splits.values()):,} rows: choose a larger {{n}}, got {n:,}"
         raise UsageError(text, remedies={"n": None})

@@ -64,6 +64,8 @@ class EndConditions:
         ]
         self._world = World(robot, placed.obstacle, placed.object_size)
         zero = np.zeros((1, 3))
+        # Built-in constraints on obstacles below an end are left out, so that the place
+        # of the ends does not matter.
         self._poses = scene_of(placed, zero, zero, zero).poses[0]
 
     def met(self, q: Array) -> NDArray[np.bool_]:
@@ -74,6 +76,7 @@ class EndConditions:
         self._world.set_state(q, np.zeros_like(q), np.zeros_like(q), self._poses)
         for constraint in self._constraints:
             for condition in constraint.measured(self._world):
+                # max(lower - g, g - upper): positive outside the bounds.
                 violation = np.maximum(
                     condition.lower - condition.g, condition.g - condition.upper
                 )
@@ -108,6 +111,8 @@ def states_of_pose(
     )
     seeds = seeds_of(kinematics.robot, POSE_SEEDS, random)
     q, met = solve_pose_ik(kinematics, positions, rotations, seeds, tolerance=tolerance)
+    # The cheap checks first: inverse kinematics, distances of links, then all other
+    # conditions state by state.
     found = q[:, met]
     valid = found if states is None else found[:, states.are_ends(found)]
     valid = valid[:, conditions.met(valid)]
@@ -124,8 +129,11 @@ def nearest_states(
     The distance is the duration of the straight line at full speed. A state is left out
     if its farthest joint differs less than ``min_difference`` from a nearer state.
     """
+    # Time of the straight line at the velocity limits: max over joints of |q - start| /
+    # v_max.
     duration = (np.abs(states - start) / robot.velocity_limit).max(axis=1)
     chosen = list[Array]()
+    # Stable: equal durations keep the order of the seeds, on every machine.
     for index in np.argsort(duration, kind="stable"):
         if len(chosen) == MAX_GOAL_STATES:
             break
@@ -264,6 +272,7 @@ class PoseTasks:
         clear = self._states is None or self._states.are_ends(start[:, None])[0]
         if not (clear and self._conditions.met(start[:, None])[0]):
             return START_REASON
+        # The same seeds for each task: its result does not depend on the other tasks.
         random = np.random.default_rng(POSE_SEEDS)
         checks = self._states, self._conditions
         goals, found = states_of_pose(
@@ -282,6 +291,7 @@ class PoseTasks:
         )
         if text := quaternion_error(wxyz):
             raise UsageError(f"{text} in task {task}", argument="goal_wxyz")
+        # A tolerance of pi about all axes accepts any rotation.
         free = np.zeros(3) if "goal_wxyz" in given else np.full(3, np.pi)
         tolerances = {
             "goal_xyz_tolerance": np.zeros(3),

@@ -141,6 +141,7 @@ def make_dataset(
         backend=chosen.backend,
         force=force,
     )
+    # The specification in the folder may differ in informational keys, which are kept.
     job = replace(job, spec=open_workspace(folder, job.spec, force=force))
     return run(
         job,
@@ -194,6 +195,8 @@ def _part(tasks: list[ShardTask], part: tuple[int, int] | None) -> list[ShardTas
     Consecutive shards, which may share a block, stay together.
     """
     k, m = part or (0, 1)
+    # Parts of contiguous shards: k N / m to (k + 1) N / m, whose sizes differ by at
+    # most one.
     return tasks[k * len(tasks) // m : (k + 1) * len(tasks) // m]
 
 
@@ -236,6 +239,7 @@ def _results(
         return
     with assembled(engine, len(tasks), quick=is_quick(job.spec, tasks)) as pool:
         groups = runs(job.spec, tasks, pool.size)
+        # One local process makes the shards itself.
         if pool.size == 1 and not pool.is_remote:
             for group in groups:
                 yield from make_shards(job, group)
@@ -285,6 +289,7 @@ def runs(
             max(rows // (MIN_RUNS_PER_WORKER * workers * spec.block_rows), 1), blocks
         )
     rows = spec.block_rows * blocks
+    # A run has the shards that begin within the same blocks of one split.
     return [
         list(group)
         for _, group in groupby(
@@ -304,6 +309,8 @@ def finish(
     if pending(folder, spec):
         return False, []
     has_checksum, damaged = (folder / MANIFEST).exists(), list[str]()
+    # A run that made nothing keeps documents that are intact, and with them their
+    # bytes.
     if made == 0 and (has_checksum or exclusive):
         findings = check_documents(folder, spec)
         if not findings:
@@ -356,6 +363,8 @@ def _problem(folder: Path, spec: DatasetSpec, task: ShardTask) -> str:
     """Return a description of the damage of a shard; empty for an intact shard."""
     try:
         check_committed(folder, spec, task)
+        # The sha256 shows that the bytes are those of the record, not that the record
+        # fits the specification.
         read_rows(Shard(folder, spec, task))
     except DatasetError as error:
         return str(error)

@@ -103,7 +103,9 @@ def make_shards(
         checked = replace(
             sampling, verification=spot_check(prepared, columns, job.spec, task, scenes)
         )
+        # Before each commit: a replaced dataset must not receive shards of this one.
         require_dataset_spec(job.folder, job.spec)
+        # With a fixed date the bytes of records must not depend on the machine's speed.
         seconds = 0.0 if job.date else round(time.perf_counter() - clock, 3)
         commit_shard(
             job.folder,
@@ -156,6 +158,7 @@ def _chunks(
         begin = index * size
         ranges = [
             (
+                # Rows of the shard relative to the block, clipped to it.
                 max(task.first_row - begin, 0),
                 min(task.first_row + task.rows - begin, size),
             )
@@ -197,6 +200,7 @@ def spot_check(
     """
     from cnpgen.judges.rows.verify import verify_rows
 
+    # Rows are spread evenly, so that a few blocks do not stand for the whole shard.
     rows = np.unique(np.linspace(0, task.rows - 1, MAX_SPOT_CHECK_ROWS).astype(int))
     some = {name: values[rows] for name, values in columns.items()}
     if scenes is not None:
@@ -234,6 +238,7 @@ def _prepared(job: Job) -> PreparedPipeline:
     """Prepare the pipeline of a job once per process."""
     key = f"{job.spec.fingerprint} {job.cache_folder}"
     if key not in _PREPARED:
+        # Only the last pipeline is kept in memory.
         _PREPARED.clear()
         _PREPARED[key] = prepare(job)
     return _PREPARED[key]

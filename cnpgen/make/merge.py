@@ -67,6 +67,7 @@ def merge_datasets(
         )
     out, folders = Path(out), [Path(part) for part in parts]
     spec = _common_spec(folders)
+    # A part may be the output itself: its shards stay where they are.
     others = [folder for folder in folders if folder.resolve() != out.resolve()]
     workspace = find_workspace(out)
     check_place(workspace)
@@ -126,6 +127,7 @@ def _owners(
                 f"{holders[0]} and {holders[1]} both have {task.file}: parts must not overlap"
             )
         if is_committed(out, spec, task):
+            # Equal records are those of an earlier, interrupted merge.
             if holders and read_file(holders[0] / task.sidecar) != read_file(
                 out / task.sidecar
             ):
@@ -149,6 +151,8 @@ def _copy(folder: Path, out: Path, task: ShardTask, spec: DatasetSpec) -> None:
     record = load_committed(folder, spec, task)
     with committing(out / task.file, out / WORK) as temporary:
         shutil.copyfile(folder / task.file, temporary)
+        # The copy is compared, not the source, so that errors of copying are found,
+        # too.
         if file_sha256(temporary) != record.sha256:
             raise DatasetError(
                 f"{folder / task.file} was changed: its sha256 is not the recorded one"

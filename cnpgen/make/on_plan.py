@@ -88,6 +88,7 @@ def planner_boundary(columns: Mapping[str, Array], planner: "Planner") -> Bounda
     names = [
         name
         for name in CONDITIONS
+        # Models that fix fewer derivatives leave the acceleration at the goal free.
         if name != "goal_ddq" or planner.model.fixed_at_goal == 3
     ]
     return Boundary(**{name: columns[name] for name in names if name in columns})
@@ -152,6 +153,8 @@ class StartOnPlan(Stage):
         make = self._maker(context)
 
         def work(candidates: CandidateBatch, random: np.random.Generator) -> None:
+            # All candidates draw all three numbers, so that an option does not change
+            # the other draws.
             moves, refines, times = (candidates.draw(random, 1)[0] for _ in range(3))
             moved = moves < self.moved
             owner, motion = make(candidates, moved & (refines < self.refined))
@@ -159,8 +162,10 @@ class StartOnPlan(Stage):
                 candidates[of_plan(name)] = np.take(
                     candidates["start_q" if name == "home_q" else name], owner, axis=1
                 )
+            # Uniform between low and high, as a fraction of the duration.
             phase = self.times.low + (self.times.high - self.times.low) * times
             states = states_at_times(motion, phase * motion.duration())
+            # Plans meet the table within a tolerance, starts of samples exactly.
             projected = exact(*(np.ascontiguousarray(state.T) for state in states))
             for name, values in zip(START, projected, strict=True):
                 candidates[name] = np.where(moved, values, candidates[name])
@@ -192,6 +197,8 @@ class StartOnPlan(Stage):
             }
             motion = planner.plan_batch(planner_boundary(columns, planner)).motion
             owner, some = np.arange(len(motion)), np.flatnonzero(refined)
+            # One plan of each group of candidates is refined; all of the group start on
+            # it.
             few = some[::STATES_PER_REFINED_PLAN]
             owner[some] = np.repeat(few, STATES_PER_REFINED_PLAN)[: len(some)]
             path, rate = motion.path.copy(), motion.rate.copy()
@@ -200,6 +207,7 @@ class StartOnPlan(Stage):
                     {name: values[few] for name, values in columns.items()},
                     initial_guess=motion[few],
                 )
+            # The motion of each candidate is then that of its owner.
             path[few], rate[few] = better.path, better.rate
             return owner, Motion(path[owner], rate[owner], motion.degree)
 

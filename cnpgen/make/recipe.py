@@ -118,6 +118,7 @@ def resolved_digest(pipeline: Mapping[str, Any], urdf: bytes) -> str:
 
     See ``recipe_digest``.
     """
+    # Titles and file names do not change rows; the text of the URDF does.
     content = {key: value for key, value in pipeline.items() if key != "title"}
     content |= {
         "problem": without_labels(pipeline["problem"]),
@@ -191,6 +192,7 @@ def restore_dataset_recipe(
         parsed = parse(Pipeline, value, where=where, errors=errors, readers=readers)
         return parsed and replace(parsed, path=path)
 
+    # Values of a stored recipe may be implausible, since it cannot be edited.
     with stored_values():
         recipe = parse(
             DatasetRecipe,
@@ -210,6 +212,7 @@ def restored(spec: DatasetSpec) -> Iterator[DatasetRecipe]:
 
     Its URDF is in a temporary folder for the duration of the block.
     """
+    # Both raise DatasetError for a specification without problem or stages.
     urdf, _ = spec.problem.urdf, spec.stages
     with (
         tempfile.TemporaryDirectory(prefix="cnpgen-") as folder,

@@ -64,6 +64,7 @@ def resolve(
         # Another dataset, or one that will be deleted.
         begun = None
     if begun is not None:
+        # A dataset is continued as it was begun, unless the caller states otherwise.
         backend = begun.backend if backend is None else backend
         shard_size = begun.shard_size if shard_size is None else shard_size
     chosen, cache_folder = choose_backend(backend)
@@ -95,6 +96,8 @@ def resolve(
         fields=prepared.fields,
         robot=_robot_record(prepared),
         versions=versions(),
+        # An extended dataset keeps its earlier versions, which determine the limits of
+        # its shards.
         previous_splits=begun.previous_splits
         if begun is not None and begun.splits == splits
         else (),
@@ -149,6 +152,7 @@ def _solved_tasks(
         prepared.complete_listed_tasks(seed),
         sum(recipe.splits.values()) if n is None else n,
     )
+    # Only tasks that a stage completed become rows.
     rows = len(tasks.alive)
     if not rows or (n is not None and n > rows):
         counts = zip(

@@ -201,6 +201,8 @@ def solve_scenes(
     loaded, scenes = as_problem(problem), [checked_scene(scene) for scene in scenes]
     robot = load_robot(loaded)
     _check_initial(loaded, len(scenes), chosen.initial)
+    # Scenes are placed before the problem changes, since attached objects have poses in
+    # frames of links.
     placed = [placed_scene(scene, robot, start_state(scene, robot)) for scene in scenes]
     loaded, robot, scenes = requested_problem(
         loaded, robot, placed, payload=chosen.payload
@@ -215,6 +217,7 @@ def solve_scenes(
 
     capacity = capacity_of(scenes)
     found, times, journals = dict[int, tuple[Plans, Attempt]](), NO_TIME, list[Path]()
+    # Scenes of one capacity share kernels; each group has its own journal.
     for own, indices in _groups(scenes):
         file = None if journal is None else Path(f"{journal}.{len(journals)}")
         journals += [] if file is None else [file]
@@ -235,6 +238,8 @@ def solve_scenes(
             progress=report,
         )
         times += refinement.times
+        # All plans of one file have the same obstacles, so that smaller groups get
+        # parked ones.
         wide = with_wider_capacity(_without_options(refinement), loaded, own, capacity)
         for row, (index, attempt) in enumerate(
             zip(indices, refinement.results, strict=True)
@@ -276,6 +281,7 @@ def _adjusted(plans: Plans, run: SceneOptions) -> Plans:
         )
     if not run.smooth_stop:
         return plans
+    # Without a goal acceleration it is free; zero makes the stop smooth.
     zero = np.zeros_like(plans.boundary.goal_q)
     return replace(plans, boundary=replace(plans.boundary, goal_ddq=zero))
 
@@ -341,10 +347,13 @@ def _goals(problem: Problem, robot: Robot, scene: SceneProblem, index: int) -> A
     states = goal_states(scene, robot)
     below, above = goal_tolerances(scene, robot)
     widths = below + above
+    # A single exact goal state leaves no choice.
     if robot.shape is None or (len(states) == 1 and not widths.any()):
         return states[:MAX_GOAL_STATES]
     valid = _valid_ends(problem, robot, scene, states)
     if not len(valid) and widths.any():
+        # The exact goal states are preferred; states within the tolerances are tried
+        # where none of them is valid.
         near = _states_within(states, below, above, robot=robot, index=index)
         valid = _valid_ends(problem, robot, scene, near)
     start = start_state(scene, robot)
@@ -372,6 +381,7 @@ def _of_alternatives(
     )
     found = [_goals(problem, robot, each, index) for each in (plain, *poses)]
     states = np.concatenate(found)
+    # nan stands for a goal pose without joint positions.
     known = states[~np.isnan(states).any(axis=1)]
     if robot.shape is None or not len(known):
         return (known if len(known) else states)[:MAX_GOAL_STATES]
@@ -387,6 +397,7 @@ def _states_within(
     random = np.random.default_rng([index, TOLERANCE_SEEDS])
     count = TOLERANCE_SEEDS // len(states) + 1
     shares = random.uniform(size=(count, *states.shape))
+    # Uniform in [goal - below, goal + above].
     near = (states - below + shares * (below + above)).reshape(-1, robot.n)
     return np.clip(near, robot.position_lower, robot.position_upper)
 
@@ -401,6 +412,8 @@ def _states_of_pose(
     kinematics = PoseKinematics(robot, _frame_of(robot, scene, pose))
     states = RestingStates(problem, robot, scene.obstacles)
     conditions = EndConditions(problem, robot, scene.obstacles)
+    # The index of the scene seeds the search: its result does not depend on the number
+    # of workers.
     random = np.random.default_rng([index, POSE_SEEDS])
     start = start_state(scene, robot)
     goals, found = states_of_pose(

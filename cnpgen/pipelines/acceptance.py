@@ -90,6 +90,7 @@ def acceptance(
         obstacle_poses = candidate_poses(context.problem, candidates)
         counts = []
         for end in ends:
+            # A free acceleration is not checked: zero takes its place in the kernel.
             acceleration = candidates.columns.get(f"{end}_ddq")
             if acceleration is None:
                 acceleration = np.zeros((n, len(candidates.alive)))
@@ -101,12 +102,15 @@ def acceptance(
                 *(candidates[name] for name in hit[end]),
             )
             if decide := decisions[end]:
+                # Only candidates that meet everything else need Coal.
                 remaining = count[: constraints + 1].max(axis=0) <= 0
                 count[:constraints] += decide(
                     state, obstacle_poses, remaining, candidates
                 )
             counts.append(count)
         start, goal = counts
+        # A row is unmet if it is at one of both ends; the goal may have one row more,
+        # the direction of the hit.
         np.maximum(start, goal[: len(start)], out=goal[: len(start)])
         candidates.reject_first(goal <= 0, reasons)
 
@@ -146,6 +150,7 @@ def boundary_unmet(
             for condition in constraint.symbolic(state)
         }
         for condition in constraint.symbolic_at(state, end):
+            # A conservative condition proves no violation; the narrow phase decides.
             if condition.sufficient:
                 continue
             if symbolic_needs(condition, *columns[1:3]) <= needs and (
@@ -177,6 +182,7 @@ def _direction_unmet(
     import casadi as ca
 
     cosine, sine = ca.cos(angle), ca.sin(angle)
+    # Components of the velocity across the hit, d x v, and along it, d . v.
     across = ca.fabs(cosine * velocity[1] - sine * velocity[0])
     along = cosine * velocity[0] + sine * velocity[1] - speed
     exact = BOUNDARY_TOLERANCES[dtype]
@@ -221,6 +227,8 @@ def narrow_phase_of(context: Context, end: End, *, exact: bool = True) -> Decide
             (unmet_counts > 0) & mask,
             np.zeros(unmet_counts.shape, bool),
         )
+        # The batched check has one scene for all states; others are measured one by
+        # one.
         one_scene = bool(np.all(obstacle_poses == obstacle_poses[:, :1]))
         for row in np.flatnonzero(remaining.any(axis=1)):
             if problem.constraint[row].uses_obstacles and not one_scene:
@@ -286,6 +294,7 @@ def narrow_phase_of_scenes(context: Context, end: End, *, exact: bool = True) ->
                 MIN_SCENE_MARGIN_M,
                 MIN_SCENE_MARGIN_M,
             )
+        # Compiled code proves most states clear; Coal decides on the others.
         remaining[by_distance] = ~clear & mask
         remaining[conservative] = mask
         return measure_one_by_one(state, obstacle_poses, remaining)
@@ -367,6 +376,7 @@ def unmet(condition: Condition, tolerance: Array) -> Scalar:
         condition.g, condition.lower, condition.upper, tolerance, strict=True
     ):
         if np.isfinite(low):
+            # Negated, so that nan counts as unmet.
             count = count + ca.logic_not(value >= float(low - allowed))
         if np.isfinite(high):
             count = count + ca.logic_not(value <= float(high + allowed))

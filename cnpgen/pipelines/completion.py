@@ -80,6 +80,7 @@ class Completion:
         """
         candidates = TaskBatch(max(values.shape[1] for values in columns.values()))
         for name, values in columns.items():
+            # Positions on a table may have x and y only.
             flat = len(values) == 2 and name.endswith("_xyz")
             whole = (
                 self._on_table(values, columns.get("parameters")) if flat else values
@@ -90,6 +91,7 @@ class Completion:
                 else np.broadcast_to(whole, (len(whole), candidates.size))
             )
             candidates[name] = np.ascontiguousarray(same)
+        # Joint positions are derived before the tip positions that follow from them.
         for name in self._derived:
             if name == "start_q":
                 candidates[name] = np.repeat(
@@ -142,6 +144,7 @@ class Completion:
         )
         if frame is not None:
             start, goal = frame.to_table(start), frame.to_table(goal)
+        # Unit velocity along the hit: only its direction determines the puck.
         direction = np.stack(
             [np.cos(angle), np.sin(angle), np.zeros(tasks.size)], axis=1
         )

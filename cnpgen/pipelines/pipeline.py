@@ -211,9 +211,11 @@ def stored_fields(steps: Sequence[PipelineStep], context: Context) -> tuple[Fiel
                 text = f"declares {item.name} as {_declared(item, before)}, but stage {origin.number} ({origin.kind})"
                 text += f" before it as {_declared(before, item)}: a stage may not redefine a field"
                 errors.append(step.error(text))
+            # A later stage may narrow limits and role.
             fields[item.name] = item
     if errors:
         raise RecipeError(errors)
+    # The stored order does not depend on the order of stages.
     known = [fields.pop(name) for name in FIELD_ORDER if name in fields]
     return (
         *known,
@@ -271,6 +273,7 @@ def written_columns(
     written: set[str] = set()
     errors = []
     for step in steps:
+        # Inputs must be written before: stages run in order.
         if missing := [name for name in step.stage.inputs if name not in written]:
             errors.append(
                 step.error(

@@ -119,6 +119,8 @@ class PreparedPipeline:
         too few candidates are accepted.
         """
         random = random_generator(seed, split, index)
+        # A block is always sampled from its beginning, so that its rows do not depend
+        # on the requested range.
         waiting = deque(BlockChunk(self.fields, first, stop) for first, stop in ranges)
         accepted = tried = 0
         while waiting:
@@ -136,6 +138,8 @@ class PreparedPipeline:
         for label, run_stage in self._stages:
             candidates.stage = label
             run_stage(candidates, random)
+        # Values are rounded before they are checked: the check is that of the stored
+        # values.
         if self.context.dtype == "float32":
             for field in self.fields:
                 if field.name in candidates.columns:
@@ -152,10 +156,12 @@ class PreparedPipeline:
         rows = self.block_rows
         if self.tasks is not None:
             return self.tasks
+        # The accepted fraction is not known yet.
         if tried == 0:
             return rows // 2
         if accepted == 0:
             return 2 * rows
+        # Candidates for the missing rows at the accepted fraction so far.
         missing = (rows - accepted) * tried / accepted
         return int(np.clip(np.ceil(1.03 * missing) + rows // 128, rows // 16, 2 * rows))
 
@@ -226,6 +232,7 @@ class BlockChunk:
         end = accepted + len(taken)
         if end < self.first:
             return False
+        # Rows of the batch that belong to an earlier chunk.
         skip = min(max(self.first - accepted, 0), len(taken))
         # No later chunk counts the candidates after the last row.
         final = candidates.last and end == accepted + len(candidates.alive)
@@ -271,6 +278,7 @@ class BlockChunk:
         Return the candidates per row.
         """
         rows = taken[first:]
+        # Candidates after the last row of an earlier chunk are those of this one.
         start = int(taken[first - 1]) + 1 if first else 0
         stop = int(taken[-1]) + 1 if last else candidates.size
         if first:
@@ -293,6 +301,7 @@ class BlockChunk:
                 for x in (cells, cells[rows - start])
             )
             self._cells[field.name] += np.stack(list(counts))
+        # Candidates per accepted one; those of earlier batches count for the first.
         attempts = np.diff(rows, prepend=start - 1 - self._waiting).astype(np.int64)
         self._waiting = (
             stop - 1 - int(rows[-1]) if len(rows) else self._waiting + stop - start
@@ -346,6 +355,7 @@ def _cells(position: Array, field: Field) -> NDArray[np.intp]:
     """Return the index of the cell of each position, for positions of shape (3, n)."""
     index = np.zeros(position.shape[1], np.intp)
     for axis, (low, high) in enumerate(_extent(field)):
+        # A range of one point has all positions in one cell.
         fraction = (position[axis] - low) / max(high - low, 1e-300)
         index = index * DENSITY_CELLS + np.clip(
             (fraction * DENSITY_CELLS).astype(np.intp), 0, DENSITY_CELLS - 1
@@ -358,6 +368,8 @@ def random_generator(seed: int, split: str, index: int) -> np.random.Generator:
 
     Sha256 of the split, block).
     """
+    # The name of the split as words of a spawn key: splits and blocks have independent
+    # generators.
     words = np.frombuffer(hashlib.sha256(split.encode()).digest(), "<u4").tolist()
     sequence = np.random.SeedSequence(seed, spawn_key=(*words, index))
     return np.random.Generator(np.random.SFC64(sequence))
@@ -376,6 +388,8 @@ def as_stored(values: Array, field: Field) -> Array:
         if bound is not None:
             limit = np.array(bound)[:, None]
             stored = limit.astype(np.float32)
+            # A bound that float32 rounds outwards is replaced by its next number
+            # inwards.
             stored = np.where(
                 violates(stored, limit),
                 np.nextafter(stored, np.float32(inwards)),

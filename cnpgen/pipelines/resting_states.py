@@ -62,6 +62,7 @@ class RestingStates:
             return np.zeros(0, bool)
         bodies = self._bodies
         bodies.place(*self._kinematics.poses(q), self._solids)
+        # The margin does not apply to distances of links from each other.
         clear = bodies.pair_distances(bodies.obstacle_pairs).clear_states(
             self._clearance + margin
         )
@@ -94,12 +95,14 @@ class RestingStates:
             q <= robot.position_upper[:, None]
         )
         valid = np.array(np.logical_and.reduce(inside))
+        # Each check only has the states that the cheaper ones before it accept.
         valid[valid] = self.can_hold(q[:, valid])
         valid[valid] = self.are_clear(q[:, valid], margin=margin)
         return valid
 
     def is_line_clear(self, start: Array, goal: Array) -> bool:
         """Return whether the straight line between two joint positions is clear."""
+        # No joint moves by more than the spacing from one state to the next.
         count = max(2, int(np.ceil(np.abs(goal - start).max() / LINE_SPACING_RAD)) + 1)
         return bool(self.are_clear(np.linspace(start, goal, count).T.copy()).all())
 

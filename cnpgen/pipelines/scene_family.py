@@ -97,4 +97,5 @@ def uniform(random: np.random.Generator, interval: Range) -> float:
 
 def whole(random: np.random.Generator, interval: Range) -> int:
     """Draw a whole number from an interval, both ends included."""
+    # The upper end of integers() is exclusive.
     return int(random.integers(round(interval.low), round(interval.high) + 1))

@@ -37,6 +37,7 @@ def tips_at_ends(robot: Robot, problem: Problem, *, fixed_at_goal: int) -> Any:
     import casadi as ca
 
     ends_sx, ends = symbols("ends", (3 + fixed_at_goal) * robot.n)
+    # Order of the ends: q, dq, ddq at the start, then q, dq and maybe ddq at the goal.
     q, _, _, goal_q, goal_dq, *_ = _split(ends, robot.n)
     start, goal = (
         forward_kinematics(robot.chain, position) for position in (q, goal_q)
@@ -69,6 +70,7 @@ def line_change(
         problem.trajectory,
     )
     poses_sx, obstacle_poses = symbols("obstacle_poses", problem.scene_width)
+    # Equal rate control points are a constant rate: r' = 0 at the ends.
     points = _points(_split(ends, robot.n), [rate] * spec.rate_control_points, spec)
     interior = slice(3, -fixed_at_goal)
     offsets_sx, scalars = symbols(
@@ -151,6 +153,7 @@ def path_change_adjoint(robot: Robot, problem: Problem, **options: Any) -> Any:
 
     path, obstacle_poses, change = _path_change(robot, problem, options)
     seed = ca.SX.sym("seed", change.numel())
+    # Reverse mode: one product with the transposed Jacobian, whatever its size.
     gradient = ca.densify(ca.jtimes(change, path, seed, True))
     return ca.Function(
         "path_change_adjoint", [path, obstacle_poses, seed], [ca.cse(gradient)]
@@ -171,6 +174,7 @@ def _path_change(
 def _points(ends: list[Vec], rates: Vec, spec: TrajectorySpec) -> list[Vec]:
     """Return all control points of the line (paper, Appendix A, as ``trajectory.boundary``)."""
     q, dq, ddq, goal_q, goal_dq, *goal_ddq = ends
+    # A rate at an end depends on its two outermost control points only.
     first = _end_points(q, dq, ddq, rates[:2], spec)
     # in reversed phase r' and p' change sign: the goal is a start with -dq
     arrival = [-v for v in goal_dq]
@@ -179,6 +183,8 @@ def _points(ends: list[Vec], rates: Vec, spec: TrajectorySpec) -> list[Vec]:
     )[::-1]
     count = spec.path_control_points - len(first) - len(last)
     along = [i / max(count - 1, 1) for i in range(count)]
+    # C_{3+i} = first + (last - first) i / (m - 1): the line joins the points that the
+    # ends determine.
     line = [
         [a + (b - a) * t for a, b in zip(first[-1], last[0], strict=True)]
         for t in along
@@ -289,6 +295,8 @@ def _linearized(
         residual, jacobian = equality(
             ca.vertcat(*position), ca.vertcat(*obstacle_poses)
         )
+        # The kernel has the Jacobian in one column, CasADi stores matrices column by
+        # column.
         columns = ca.reshape(jacobian, residual.numel(), len(position))
         for equation in range(residual.numel()):
             residuals.append(residual[equation])
@@ -317,6 +325,8 @@ def _gauss_newton(
     ]
     for i, entries in enumerate(lower):
         entries[i] += PROJECTION_DAMPING
+    # The matrix is symmetric, hence its lower triangle; the damping makes it positive
+    # definite.
     force = solve(lower, residuals)
     # Forces of all equations of one phase add up, before they spread over control
     # points.
@@ -351,6 +361,7 @@ def _combined(factors: Array, points: list[Vec]) -> Vec:
 def collocation(degree: int, points: int, interior: slice) -> tuple[Array, Array]:
     """Return the basis at K phases, (K, points), and responses of interior points to forces there, (K - 1, K)."""
     # Greville abscissae: phases at which the control points have the largest effect.
+    # The abscissa of control point i is the mean of the knots i + 1 to i + degree.
     knots, indices = clamped_knots(points, degree), range(points)[interior]
     greville = [knots[i + 1 : i + degree + 1].mean() for i in indices]
     # One more phase before the goal, where fast arrivals leave the manifold most.

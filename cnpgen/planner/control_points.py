@@ -121,6 +121,7 @@ def vjp(
 def lines_at_rest(boundary: Boundary, correction: AnyArray) -> AnyArray:
     """Return control points of lines between states at rest, shape (N, C, n), plus corrections [rad], (N, m, n)."""
     start, goal = boundary.start_q[:, None], boundary.goal_q[:, None]
+    # At rest the control points that an end fixes are all equal to its position.
     interior = start + (goal - start) * along_line(correction.shape[1]) + correction
     last = np.repeat(goal, boundary.fixed_at_goal, axis=1)
     return np.concatenate([np.repeat(start, 3, axis=1), interior, last], axis=1)
@@ -184,6 +185,7 @@ def make_projection(
 
     None if there are no steps or no equalities.
     """
+    # A problem without equalities on positions needs no projection.
     if not effective_steps(kernels, steps):
         return None
     interior = slice(3, problem.trajectory.path_control_points - fixed_at_goal)

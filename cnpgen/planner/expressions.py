@@ -110,6 +110,8 @@ def speed_violation(robot: Robot, problem: Problem) -> Any:
         ca.vertcat(columns[order], columns[orders][order - 1])
         for order in range(1, orders)
     ]
+    # Violations are functions of phase derivatives and rate: dq = p' r, ddq = p'' r^2 +
+    # p' r' r.
     dq, ddq, jerk = time_derivatives(path, rate)
     state = SymbolicState(
         robot, p, dq, ddq, obstacle_poses, problem.obstacle, problem.object_size, jerk
@@ -153,6 +155,7 @@ def speed_coefficients(robot: Robot, problem: Problem) -> Any:
     if drive is not None and (drive.viscous.any() or drive.lines):
         parts = map(ca.vertsplit, (p1, p1 * rates[0]))
         linear = [_linear_rows(robot, problem, *parts)]
+        # The evaluation at r = 1 contains the linear part, too.
         square = square - linear[0]
     bounds = speed_bounds(robot, problem)
     others, fractions = np.flatnonzero(~bounds.proportional).tolist(), []
@@ -189,6 +192,7 @@ def static_violation(robot: Robot, problem: Problem) -> Any:
 
     columns, state = state_of_symbols(robot, problem)
     zero = [0.0] * robot.n
+    # At rest torques are those of gravity.
     rest = replace(state, dq=zero, ddq=zero, jerk=zero if problem.uses_jerk else None)
     violations: list[Any] = []
     for constraint in problem.constraint:
@@ -209,6 +213,7 @@ def _violations(condition: Condition, units: Array) -> list[Any]:
     for value, low, high, unit in zip(
         condition.g, condition.lower, condition.upper, units.tolist(), strict=True
     ):
+        # Positive outside a bound; infinite bounds have no violation.
         violations += [(float(low) - value) / unit] if np.isfinite(low) else []
         violations += [(value - float(high)) / unit] if np.isfinite(high) else []
     return violations
@@ -255,6 +260,7 @@ def speed_bounds(robot: Robot, problem: Problem) -> SpeedBounds:
             condition.g, condition.lower, condition.upper, strict=True
         )
     ]
+    # The reshape gives five columns to a problem without rows, too.
     lower, upper, *masks = np.array(rows, float).reshape(-1, 5).T
     return SpeedBounds(lower, upper, *(mask.astype(bool) for mask in masks))
 
@@ -267,6 +273,7 @@ def _is_proportional(value: Any, dq: Any, low: float, high: float) -> bool:
         ca.is_linear(value, dq)
         and ca.substitute(value, dq, ca.SX.zeros(dq.shape)).is_zero()
     )
+    # Only such a row is met at rest and scales with the rate.
     return bool(linear and low < 0 < high and np.isfinite([low, high]).any())
 
 

@@ -80,6 +80,7 @@ class ViaPoints:
         bound = self._violation_at(
             self.path[COARSE_PHASES], motion.path, obstacle_poses
         )
+        # A violation at a few phases is enough; motions without one are checked at all.
         unclear = np.flatnonzero(bound <= 1)
         bound[unclear] = self.violation(motion[unclear], obstacle_poses[unclear])
         return bound
@@ -87,6 +88,7 @@ class ViaPoints:
     def _violation_at(
         self, basis_of_p: NDArray[np.float32], path: Array, obstacle_poses: Array
     ) -> Array:
+        # float32 suffices to compare motions.
         values = np.empty((1, len(basis_of_p), len(path)), np.float32)
         for block in blocks_of_motions(len(path), MOTIONS_PER_CALL):
             q = np.matmul(
@@ -95,6 +97,7 @@ class ViaPoints:
             poses = obstacle_poses[block].T.astype(np.float32, order="C")
             self.static_violation(q, poses, out=[values[..., block]])
         worst: Array = values[0].max(axis=0).astype(np.float64)
+        # A motion that is not finite is worse than any other.
         return np.nan_to_num(worst, nan=np.inf, posinf=np.inf)
 
     def best_lines(self, lines: Tasks, count: int) -> NDArray[np.intp]:
@@ -107,6 +110,7 @@ class ViaPoints:
         violation = self._violation_at(
             self.path[COARSE_PHASES], path, lines.scene.poses
         )
+        # The lines of a task are adjacent rows, one for each via point.
         order = violation.reshape(-1, len(self.via_points)).argsort(
             axis=1, kind="stable"
         )[:, :count]
@@ -123,6 +127,8 @@ class ViaPoints:
         """
         of_task = violation.reshape(-1, count)
         least = of_task.min(axis=1, keepdims=True)
+        # Violations up to 1 are within the tolerances; all such motions compete by
+        # their durations.
         return np.flatnonzero(of_task <= np.maximum(least, 1))
 
 
@@ -131,6 +137,7 @@ def make_via_points(
 ) -> ViaPoints:
     """Load the check of via points [rad], shape (M, n), for one problem."""
     spec = problem.trajectory
+    # Chebyshev phases are dense near both ends.
     path = basis(chebyshev(STATIC_INTERVALS), spec.path_control_points, spec.degree)
     kernel = kernels.load_grid(
         static_violation, GridSpec(("point", "lane"), ("point",)), dtype="float32"
@@ -232,6 +239,7 @@ class InferencePipeline:
     def _projected(self, model: Model, tasks: Tasks, ends: Array) -> Motion:
         outputs, path = self._outputs(model, tasks, ends)
         for _ in range(1, model.config.iterations):
+            # Each further evaluation corrects the path of the one before.
             outputs, path = self._outputs(model, self.prepare.along(tasks, path), ends)
         return Motion(path, outputs.rate, model.problem.trajectory.degree)
 
@@ -246,6 +254,7 @@ class InferencePipeline:
         return outputs, rows(path, tasks.boundary.start_q.shape[1])
 
     def _fitted(self, motion: Motion, obstacle_poses: Array) -> Motion:
+        # Uniform time scaling slows those motions that are still beyond their limits.
         violating = np.arange(len(motion))
         if self.time_parametrization is not None:
             motion, meets_limits = self.time_parametrization.parametrize(
@@ -258,6 +267,7 @@ class InferencePipeline:
         factor[violating] = self.time_scaling.factor(
             motion[violating], obstacle_poses[violating]
         )
+        # A factor of 1 leaves the rates to the bit.
         return motion if factor.max() <= 1 else motion.time_scaled(factor)
 
     def _with_via_points(
@@ -279,11 +289,14 @@ class InferencePipeline:
             np.flatnonzero(violation > 1),
             min(MAX_LINES, len(via_points.via_points)),
         )
+        # Blocks limit the memory: each violating task has several lines.
         for some in (violating[block] for block in blocks_of_motions(len(violating))):
             repeated = np.repeat(some, len(via_points.via_points))
             lines = self.prepare(
                 tasks.boundary[repeated], np.tile(via_points.via_points, (len(some), 1))
             )
+            # The lines themselves are ranked first, since planning along all of them
+            # costs more.
             alternatives = lines.take(via_points.best_lines(lines, count))
             assert alternatives.correction is not None
             motions = self._projected(
@@ -296,12 +309,16 @@ class InferencePipeline:
                 self._fitted(motions[candidates], poses[candidates]),
                 np.full(len(motions), np.inf),
             )
+            # Motions that are no candidates keep an infinite time, and are never the
+            # fastest.
             time[candidates] = others.duration_bound()
             fastest = time.reshape(len(some), -1).argmin(axis=1) + count * np.arange(
                 len(some)
             )
             unclear = fastest[after[fastest] > 1]  # lower bounds
             after[unclear] = via_points.violation(motions[unclear], poses[unclear])
+            # An alternative that violates as much as the first plan does not replace
+            # it.
             better = after[fastest] < violation[some]
             replaced, fastest = some[better], fastest[better]
             path[replaced], rate[replaced] = (
@@ -314,6 +331,7 @@ class InferencePipeline:
                 alternatives.correction[fastest],
             )
             kept[replaced] = False
+        # Rates are fitted once each: of replaced motions above, of all others here.
         fitted[kept] = self._fitted(motion[kept], tasks.scene.poses[kept]).rate
         self._shorten(
             via_points, tasks, Motion(path, rate, motion.degree), fitted, violation
@@ -340,6 +358,7 @@ class InferencePipeline:
         some, rate = tasks.take(slow), lanes(motion.rate[slow])
         interior = motion.path[slow, self._interior(tasks.boundary)]
         offsets = interior - anchor_line(some.boundary, motion.rate[slow], motion.spec)
+        # A part of the offsets leads the path between its line and the straight one.
         part = lanes((OFFSET_FRACTION * offsets).reshape(len(slow), -1))
         (path,) = self.path(ends_of(some.boundary), part, rate, some.scene.lanes)
         other, poses = (
@@ -348,6 +367,7 @@ class InferencePipeline:
         )
         free = np.flatnonzero(via_points.lower_bound(other, poses) <= 1)
         other = self._fitted(other[free], poses[free])
+        # Shorter motions replace the others only if they have no violation either.
         faster = other.duration_bound() < bound[slow[free]]
         replaced = slow[free[faster]]
         motion.path[replaced], fitted[replaced] = other.path[faster], other.rate[faster]
@@ -387,6 +407,7 @@ def make_inference_pipeline(
         fixed_at_goal=fixed_at_goal,
         within_limits=config.within_limits,
     )
+    # Scaling in time would change velocities at ends that are not at rest.
     time_scaling = make_time_scaling(problem, robot, kernels) if scale_time else None
     time_parametrization = (
         make_time_parametrization(problem, robot, kernels, at_rest=scale_time)

@@ -102,6 +102,7 @@ class Model:
         Sums and the exponential are in float64.
         """
         activations = forward(self._weights, self.features.of(tasks))
+        # The head ends in tanh: offsets are within +- path_scale [rad].
         offsets = self.config.path_scale * activations.path.astype(np.float64)
         if tasks.correction is not None:
             offsets += tasks.correction.reshape(offsets.shape)
@@ -133,6 +134,7 @@ def is_rest_to_rest(zero_conditions: Iterable[str], fixed_at_goal: int) -> bool:
 
     A free condition need not be zero.
     """
+    # A free acceleration at the goal is no condition.
     moving = {"start_dq", "start_ddq", "goal_dq"} | (
         {"goal_ddq"} if fixed_at_goal == 3 else set()
     )

@@ -183,6 +183,8 @@ def model_content(model: Model) -> Content:
         "config": {
             name: value
             for name, value in asdict(model.config).items()
+            # Options that were added later do not change the bytes of models without
+            # them.
             if value != _DEFAULTS.get(name)
         },
         "zero_conditions": list(model.zero_conditions),
@@ -222,6 +224,7 @@ def _assembled(content: Content) -> Model:
         parse_json(content.texts[name]) for name in ("description", "training")
     )
     check_structure(description, _STRUCTURE)
+    # The keys that this version reads must have their form; others may be of any.
     check_structure(training, {ANY_KEY: ANYTHING})
     check_structure(
         training,
@@ -297,6 +300,7 @@ def _check_config(
         raise ValueError(
             f"iterations must be an integer from 1 to {MAX_NETWORK_ITERATIONS}, got {config.iterations!r}"
         )
+    # The feature of the line is the path that an iteration corrects.
     if (config.iterations > 1) != (LINE in features.blocks):
         raise ValueError(
             f"{config.iterations} iterations do not fit the features {', '.join(features.blocks)}"
@@ -323,6 +327,7 @@ def _check_sizes(
         features.blocks, joints, len(problem.parameters), line=architecture.path_outputs
     )
     rates = spec.rate_control_points
+    # The goal fixes two control points, or three with a given acceleration.
     interior = [(spec.path_control_points - 3 - fixed) * joints for fixed in (2, 3)]
     widths = (architecture.inputs, architecture.path_outputs, architecture.rate_outputs)
     if widths not in [(inputs, outputs, rates) for outputs in interior]:
@@ -347,6 +352,7 @@ def _parameters(
     architecture: Architecture, arrays: Mapping[str, NDArray[Any]]
 ) -> NDArray[np.float32]:
     """Concatenate the arrays of all layers; check their shapes."""
+    # Before layers are listed: a damaged number may be huge.
     if architecture.layers > len(arrays):
         raise ValueError(
             f"{architecture.layers} layers cannot be in {len(arrays)} arrays"

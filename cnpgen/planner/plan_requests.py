@@ -67,6 +67,8 @@ def read_rows(
         UsageError: There are no such rows.
     """
     dataset = open_dataset(folder)
+    # A model is trained for the distribution of its rows: other rows need the caller's
+    # consent.
     check_stages(
         str(folder),
         as_record(dataset.spec.problem),
@@ -76,6 +78,7 @@ def read_rows(
     )
     rows = chosen_rows(folder, dataset.spec, split=split, start=first, n=n)
     stored = {column.name for column in dataset.spec.fields}
+    # Only columns that a task needs are read.
     names = [name for name in (*ASKED, SCENE_ID) if name in stored]
     arrays = dataset.read(split, fields=names, start=rows.start, stop=rows.stop)
     columns = context_columns(arrays | scene_columns(dataset, split, rows, arrays))
@@ -191,6 +194,7 @@ def _check_shard(file: BoundaryFile, model: Model, *, other: bool) -> None:
         check_stages(
             str(file.path), as_record(spec.problem), spec.stages, model, other=other
         )
+    # Outside its dataset a shard has only the digest of its recipe.
     elif not other and file.text("recipe_sha256") != model.training.get(
         "dataset", {}
     ).get("recipe_sha256", ""):
@@ -222,6 +226,7 @@ def checked_boundary(
 
     Raise DatasetError for goal accelerations if they are free.
     """
+    # The converse, a fixed acceleration that the file lacks, is zero.
     if "goal_ddq" in columns and model.fixed_at_goal == 2:
         raise DatasetError(
             f"{where} prescribes goal accelerations (goal_ddq), and the model leaves them free"
@@ -241,6 +246,7 @@ def check_problem(where: str, record: ProblemRecord, model: Model) -> None:
 
 def drawing_stages(stages: Iterable[Mapping[str, Any]]) -> list[Mapping[str, Any]]:
     """Return the stages that draw rows: all but the stage that certifies them."""
+    # Certifying removes rows without a valid plan and draws none.
     return [stage for stage in stages if stage.get("use") != CERTIFIED_STAGE]
 
 

@@ -239,6 +239,8 @@ class Planner:
                 f"the planner is of {self.model.problem.name!r}, the plans are of {plans.problem.name!r}",
                 concerns="plans",
             )
+        # The new plan starts at the state of the old one, so that q, dq and ddq are
+        # continuous.
         q, dq, ddq = plans.states_at(time)
         parameters = plans.boundary.parameters if parameters is None else parameters
         states = q, dq, ddq, goal_q, goal_dq, goal_ddq
@@ -254,6 +256,7 @@ class Planner:
         new = plan_tasks(self, boundary, None, columns)
         times = np.broadcast_to(numbers("time", time), (len(plans),))
         if len(plans) == 1:
+            # One plan may be continued to several goals.
             plans, times = plans[np.zeros(len(new), int)], np.repeat(times, len(new))
         return reuse_previous_plan(
             plans, times, new, acceleration_limit=self.robot.acceleration_limit
@@ -292,6 +295,7 @@ class Planner:
                 continue
             largest = np.abs(values).max(axis=1)
             row = int(largest.argmax())
+            # The network has never had such inputs.
             if (np.abs(values) > self._rest_tolerance[name]).any():
                 raise UsageError(
                     f"was zero in every row that the model was trained on, got {largest[row]:g} in plan {row}:"
@@ -337,6 +341,8 @@ def reuse_previous_plan(
     reused = np.flatnonzero(
         _same_goal(old.boundary, new.boundary)
         & (remaining_time > MIN_REMAINING_TIME_S)
+        # A new plan must be faster by more than 2 %: otherwise plans would change
+        # without gain.
         & (MAX_DURATION_RATIO * remaining_time <= new.duration)
     )
     if not len(reused):
@@ -349,6 +355,8 @@ def reuse_previous_plan(
         spec=new.motion.spec,
         acceleration_limit=acceleration_limit,
     )
+    # The remaining trajectory may have more control points; the new motions get as many
+    # without a change of shape.
     refined = with_finer_knots(new.motion, remaining.spec)
     path, rate = refined.path.copy(), refined.rate.copy()
     path[reused], rate[reused] = remaining.path, remaining.rate

@@ -131,6 +131,7 @@ class TaskPreprocessor:
             kernel, offsets = self.via_line, [lanes(correction)]
         if kernel is None:
             return correction
+        # A constant rate of 1 / T traverses the phase in the expected time.
         (change,) = kernel(ends, *offsets, 1 / time[None], scene.lanes)
         return rows(change, boundary.start_q.shape[1])
 

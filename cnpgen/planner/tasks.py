@@ -107,6 +107,7 @@ def expected_time(
     Velocity limits [rad/s] have shape (n,) or (N, n), times shape (N,) and the lower
     bound ``least`` [s].
     """
+    # T = max(least, max over joints of |goal - start| / v_max)
     joint_times: AnyArray = np.abs(boundary.goal_q - boundary.start_q) / velocity_limit
     time: AnyArray = joint_times.max(axis=1, initial=least)
     return time
@@ -144,5 +145,6 @@ def reaching_time(robot: Robot, *, fixed_at_goal: int) -> Any:
     joint_times = (
         2 * ca.fmin(peak, fastest) - first - last
     ) / acceleration + ca.if_else(peak > fastest, cruise, 0.0)
+    # All joints move at once: the slowest determines the time.
     time = reduce(ca.fmax, ca.vertsplit(joint_times), ca.SX(MIN_REACH_TIME_S))
     return ca.Function("reaching_time", [ends], [time])

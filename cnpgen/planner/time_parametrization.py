@@ -146,6 +146,7 @@ class TimeParametrization(PhaseGrid):
     def violation_tolerance(self) -> float:
         """Tolerance of the violation [SI units of the largest bound]."""
         bounds = np.abs(np.concatenate([self.lower, self.upper]))
+        # Ten times the rounding by which the bounds are relaxed.
         return 10 * BOUND_ROUNDING * float(bounds[np.isfinite(bounds)].max(initial=0.0))
 
     @cached_property
@@ -192,6 +193,7 @@ class TimeParametrization(PhaseGrid):
             + 3,
             self.path.shape[1],
         )
+        # One buffer for all motions: the C code allocates nothing.
         memory = np.empty(
             MAX_VECTOR_WIDTH * (1 + len(self.lower)) + rows * phases + rate.shape[1]
         )
@@ -221,6 +223,7 @@ def make_time_parametrization(
             f"plans of {problem.name!r} cannot be time-parametrized: it bounds the jerk"
         )
     bounds = speed_bounds(robot, problem)
+    # Powers are cubic in the rate; the coefficients describe squares.
     if bounds.power.any():
         raise UsageError(
             f"plans of {problem.name!r} cannot be time-parametrized: it bounds the power of its motors"
@@ -250,6 +253,8 @@ def _span_of(table: Array) -> NDArray[np.int64]:
     """Return first and last phase, in whole vectors, at which each control point has an effect, shape (points, 2)."""
     # Basis functions are local: only these phases change if the point moves.
     nonzero = (table != 0).any(axis=0)
+    # First phase with an effect, and the one after the last; both are widened to whole
+    # vectors.
     first, last = nonzero.argmax(axis=0), len(nonzero) - nonzero[::-1].argmax(axis=0)
     return np.stack(
         [first - first % MAX_VECTOR_WIDTH, last + -last % MAX_VECTOR_WIDTH], axis=1
@@ -265,6 +270,8 @@ def _by_point(table: Array) -> Array:
 
 def moves_of(points: int, fixed: int) -> tuple[NDArray[np.int64], Array]:
     """Return the order in which control points of the rate move, and the fractions of their steps."""
+    # Outer control points belong to the boundary conditions unless the motion is at
+    # rest there.
     movable = np.arange(fixed, points - fixed)
     # Neighbors overlap most, so they move in different halves of a sweep.
     first, second = movable[1::2], movable[::2]

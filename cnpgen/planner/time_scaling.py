@@ -57,6 +57,8 @@ class PhaseGrid:
     def column(self, motion: Motion, obstacle_poses: Array) -> Array:
         """Return path, rate, their derivatives and obstacle poses at all phases of N motions, shape (width, N K)."""
         (orders, phases, points), (count, _, n) = self.path.shape, motion.path.shape
+        # Rows of the column: derivatives of the path, then those of the rate, then
+        # poses.
         first, last = orders * n, orders * n + orders - 1
         # All phases of one motion are next to each other, so one product evaluates
         # them.
@@ -141,6 +143,7 @@ class TimeScaling(PhaseGrid):
             scaled = (term / k**order for order, term in enumerate(moving, 1))
             return np.array(self.residuals(p, *scaled, obstacle_poses, *friction)[0])
 
+        # Three values determine static + b / k + c / k^2; a cubic part needs a fourth.
         fast, slow, static = map(values, (1.0, 2.0, np.inf))
         slowest = values(4.0) if self.bounds.power.any() else static
         needed = np.ones(fast.shape[1])
@@ -193,6 +196,7 @@ def _smallest_scale(margin: Array, linear: Array, quadratic: Array) -> Array:
         root = np.sqrt(np.maximum(linear**2 + 4 * quadratic * margin, 0.0))
         # Of margin k^2 - linear k - quadratic = 0.
         k = (linear + root) / (2 * margin)
+    # Without a positive margin at rest no scale helps.
     violated = (linear + quadratic > margin) & (margin > 0) & np.isfinite(k)
     return np.where(violated, np.maximum(k, 1.0), 1.0)
 
@@ -201,12 +205,16 @@ def _smallest_scale_of_powers(
     margin: Array, fast: Array, slow: Array, slowest: Array
 ) -> Array:
     """Return k >= 1 with ``a / k + b / k^2 + d / k^3 = margin > 0`` from values at k = 1, 2 and 4, where 1 is too fast."""
+    # fast = a + b + d, slow = a / 2 + b / 4 + d / 8. With slowest = a / 4 + b / 16 + d
+    # / 64 they determine a, b and d.
     a = (64 * slowest - 24 * slow + 2 * fast) / 6
     b = 8 * slow - fast - 3 * a
     d = fast - a - b
     low, high = np.full(len(fast), 1 / MAX_TIME_SCALE), np.ones(len(fast))  # of 1 / k
     for _ in range(POWER_BISECTIONS):
         x = (low + high) / 2
+        # x = 1 / k: the polynomial exceeds the margin at x = 1, and bisection keeps the
+        # side within it.
         within = ((d * x + b) * x + a) * x <= margin
         low, high = np.where(within, x, low), np.where(within, high, x)
     return np.asarray(1 / low)

@@ -90,6 +90,8 @@ class BoundaryFile:
         mine = self.text("specification_fingerprint")
         return (
             spec
+            # A shard of an extended dataset may be of an earlier version of the
+            # specification.
             if any(each.fingerprint == mine for each in spec.spec_versions)
             else None
         )
@@ -102,6 +104,7 @@ class BoundaryFile:
                 "/".join(self.path.absolute().parts[-2:]),
             )
             for task in shards(spec):
+                # Other files in the folder are not compared with the specification.
                 if task.file == name:
                     read_rows(Shard(folder, spec, task))
 
@@ -184,6 +187,7 @@ def read_boundary_file(path: Path) -> BoundaryFile:
     require_file(
         path, "a dataset or an HDF5 file of boundary conditions", kinds=HDF5_KINDS
     )
+    # Before HDF5 reads the file, which may hang on a damaged one.
     has_checksum = verify_checksum(path, kind=FORMAT, version=PLAN_FILE_VERSION)
     with open_hdf5(path) as file:
         attributes = file.attributes.some(SAID)
@@ -219,6 +223,7 @@ def boundary_in(where: str, columns: Mapping[str, NDArray[Any]], n: int) -> Boun
         raise DatasetError(f"{where}: {error}") from error
     # in files, one row does not broadcast to all
     for name, values in given.items():
+        # Parameters have their own width, all other conditions one column per joint.
         width = values.shape[-1] if name == "parameters" else n
         if values.size != len(boundary) * width:
             raise DatasetError(
@@ -328,6 +333,7 @@ def chosen_rows(
         raise UsageError(
             f"{folder} {lacks('split', split, spec.splits)}", concerns="split"
         )
+    # Ranges are refused where they end outside the split, not shortened.
     rows = spec.splits[split]
     stop = rows if n is None else start + integer("n", n, least=1)
     if not start < stop <= rows:
@@ -361,6 +367,7 @@ def _of_file(
         raise DatasetError(
             f"{path} is of another problem than {problem.name!r}: its problem_sha256 is not this one's"
         )
+    # Parked obstacles would be planned around in place of those of the samples.
     file.check_obstacles(problem)
     boundary = file.boundary(
         open_problem(problem)[1], allow_large_angles=allow_large_angles
@@ -386,6 +393,8 @@ def plans_of_rows(
     spec = problem.trajectory
     rows, n = columns["start_q"].shape
     kept = ("start_xyz", "goal_xyz", OBSTACLE_POSES, GOAL_OPTION, *CONTEXT)
+    # Rows without motions get control points of nan in the shape that the problem
+    # suggests.
     points, rates = spec.path_control_points, spec.rate_control_points
     path, rate = (
         columns.get(f"{part}_control_points", np.array(np.nan))

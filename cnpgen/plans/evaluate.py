@@ -164,6 +164,8 @@ def evaluate_plans(
         if tracking_error is None
         else tuple(np.atleast_1d(numbers("tracking_error", tracking_error)).tolist())
     )
+    # Obstacles may stand below the tip positions in the columns, which must fit the
+    # joints.
     plans = correct_tips(plans)
     workers = (
         1 if workers is None and len(plans) <= MAX_PLANS_OF_ONE_PROCESS else workers
@@ -187,6 +189,7 @@ def judged_in_parts(
 
     Return the results in order.
     """
+    # A part is judged in one batch, and progress is reported part by part.
     parts = [items[first : first + size] for first in range(0, len(items), size)]
     results: list[T] = []
     with closing(
@@ -201,6 +204,7 @@ def judged_in_parts(
 
 def _judge(plans: Plans, *, step: float, error: tuple[float, ...]) -> list[Verdict]:
     problem, robot = open_problem(plans.problem)
+    # One number holds for all joints.
     tracking_error = (error if len(error) > 1 else error[0]) if error else None
     return judge(
         problem,

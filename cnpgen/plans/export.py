@@ -59,6 +59,7 @@ def load_exporter(name: str) -> Exporter:
         kind: type[Exporter] = registry.load(registry.EXPORTERS, name)
     except RecipeError as error:
         raise UsageError(f"{error}", concerns="to") from error
+    # Names of formats have no arguments on the command line.
     if fields(kind) or not getattr(kind, "suffix", ""):
         raise UsageError(
             f"exporter {name!r}: {kind.__name__} must have a suffix and no fields",
@@ -195,6 +196,7 @@ def _environment(
         **last.columns,
     }
     if last.boundary.parameters is not None:
+        # Parameters of the problem are columns of their own names.
         columns |= zip(
             plans.problem.parameters.names, last.boundary.parameters.T, strict=True
         )
@@ -204,6 +206,7 @@ def _environment(
     numbers = {
         name: np.asarray(values, np.float64)
         for name, values in columns.items()
+        # Tables of an environment hold numbers only.
         if values.dtype.kind in "fiu"
     }
     return {
@@ -253,6 +256,7 @@ def _why_not(
     duration = plans.duration[index]
     if status != PlanStatus.UNKNOWN:
         return status.text
+    # Stamps of 1 ns could not order two samples.
     if duration < 1e-9:
         return f"it lasts {duration:.3g} s, less than a nanosecond"
     if duration * rate > MAX_SAMPLES:
@@ -272,6 +276,7 @@ def _sampled(
     motion, parameters = plans.motion, _last(plans).boundary.parameters
     for index in kept:
         values = () if parameters is None else tuple(parameters[index].tolist())
+        # One plan at a time: samples of all plans may not fit into memory.
         yield sample_plan(motion[[index]], rate, index, values, ticks_per_s)
 
 
@@ -284,6 +289,8 @@ def _with_torques(
     for plan in sampled:
         poses = _last(plans).scene.poses[plan.index]
         world.set_path(plan.q.T, plan.dq.T, plan.ddq.T, poses)
+        # c sign(dq), 0 at rest: the verdict allows for any friction there, an exported
+        # table needs one value.
         friction = drive.coulomb[:, None] * np.sign(world.dq)
         motor = np.asarray(world.linear_torque + friction).T
         yield replace(plan, joint_torque=np.array(world.torque.T), motor_torque=motor)

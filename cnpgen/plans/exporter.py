@@ -143,9 +143,12 @@ def sample_plan(
 ) -> SampledPlan:
     """Sample one motion at ``rate`` [Hz], and at its last instant, or the last tick before it."""
     duration = float(motion.duration()[0])
+    # Times k / rate for k < count, then the duration itself.
     count = max(math.ceil(duration * rate - MIN_LAST_STEP_FRACTION), 1)
     t = np.append(np.arange(count) / rate, duration)
     if ticks_per_s is not None:
+        # Times are rounded to ticks; the last must not exceed the duration, where the
+        # motion ends.
         ticks = np.minimum(np.rint(t * ticks_per_s), np.floor(duration * ticks_per_s))
         t = ticks / ticks_per_s
     states = motion.at_times(t[None])

@@ -129,6 +129,7 @@ def refuse_misspelt(path: Path, names: Collection[str], asked: Collection[str]) 
         meant = difflib.get_close_matches(
             name.lower(), missing, n=1, cutoff=MIN_SIMILARITY
         )
+        # Names with a definition of their own are no misspellings, however similar.
         if meant and name not in KNOWN:
             raise DatasetError(
                 f"{path}: {name!r} is almost {meant[0]!r}, which the file lacks: rename or remove it"

@@ -89,6 +89,7 @@ class CsvTables(Exporter):
             for name in exported.columns
             for i, joint in joints
         ]
+        # This format has one file per plan.
         (plan,) = plans
         phase = [] if plan.phase is None else [plan.phase]
         writer.writerow(
@@ -262,6 +263,7 @@ class PathSplines(Exporter):
 
 def _point_text(plan: SampledPlan, k: int, *, effort: bool = True) -> str:
     """Return sample k of a plan as a ``trajectory_msgs/JointTrajectoryPoint`` in one line of JSON that is also YAML."""
+    # Stamps are integers: whole seconds and the nanoseconds in them.
     sec, nanosec = divmod(round(plan.t[k] * NANOSECONDS), NANOSECONDS)
     values = {"positions": plan.q, "velocities": plan.dq, "accelerations": plan.ddq}
     point: dict[str, Any] = {name: rows[k].tolist() for name, rows in values.items()}
@@ -284,8 +286,11 @@ def _spline_columns(
     from scipy.interpolate import BSpline
 
     count, points, degree = len(motion.path), motion.path.shape[1], motion.degree
+    # A clamped knot vector repeats both ends degree + 1 times, so that the curve starts
+    # and ends at control points.
     inner = np.linspace(0, 1, points - degree + 1)
     knots = np.concatenate([np.zeros(degree), inner, np.ones(degree)])
+    # scipy takes the control points along the first axis, all plans at once.
     control = motion.path.transpose(1, 0, 2)
     waypoints = BSpline(knots, control, degree)(
         np.linspace(0, 1, PATH_WAYPOINTS)
@@ -306,6 +311,7 @@ def fixed_lists(values: NDArray[Any]) -> Any:
     """Return an array of shape (K, w) as K lists of w values."""
     import pyarrow
 
+    # Rows of one width need no list of offsets.
     flat = pyarrow.array(np.ascontiguousarray(values).ravel())
     return pyarrow.FixedSizeListArray.from_arrays(flat, values.shape[1])
 

@@ -54,6 +54,8 @@ class JoinedPlans:
     def status(self) -> NDArray[np.uint8]:
         """Status of each sequence, shape (N,): valid if all plans are valid, not valid if one plan is not valid."""
         status = np.array([part.status for part in self.parts])
+        # A sequence is valid only if all parts are; one invalid part decides, whatever
+        # is known of the others.
         known = np.where(
             (status == PlanStatus.VALID).all(axis=0),
             PlanStatus.VALID,
@@ -105,6 +107,7 @@ def join_plans(
             f"{len(joined)} plans are followed by {len(following)}, expected one for each",
             concerns="following",
         )
+    # Tolerances and the base configuration may differ.
     if following.problem.comparable_sha256 != joined.problem.comparable_sha256:
         differs = ", ".join(following.problem.differences(joined.problem)[:4])
         raise UsageError(
@@ -152,6 +155,7 @@ def concatenate(parts: Sequence[Plans]) -> Plans:
     return replace(
         first,
         source="; ".join(filter(None, sources)),
+        # Different options cannot be stated in one note.
         refined_with=options[0] if len(options) == 1 else "",
         boundary=join_boundaries([part.boundary for part in parts]),
         path_control_points=np.concatenate(

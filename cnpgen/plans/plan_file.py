@@ -92,6 +92,8 @@ def load_plans(
         attributes = file.attributes.some((*ATTRIBUTES, *NOTES))
         _check_format(path, attributes)
         columns = _columns(path, file)
+    # Files of cnpgen have the names of the format; others may have misspelled optional
+    # ones.
     if not has_checksum:
         refuse_misspelt(path, columns, CONDITIONS)
     record = agreed_problem(
@@ -141,6 +143,7 @@ def _read(path: Path, name: str, dataset: Column) -> NDArray[Any]:
     values = dataset.read()
     if name not in INTEGERS:
         return np.asarray(values, np.float64)
+    # Unsigned integers of 64 bits may exceed int64.
     if values.size and values.max() > np.iinfo(np.int64).max:
         raise DatasetError(
             f"{path}: {name} must hold integers below 2^63, got {values.max()}"
@@ -206,6 +209,8 @@ def agreed_problem(
             record and extrapolated_record(record, parameters)
             for record in (stored, wanted)
         )
+    # The problem of the file decides; one that the caller names must have comparable
+    # plans.
     found = stored or wanted
     if found is None:
         help_ = f"set its attribute 'problem' to a name or a file, or pass {{problem}} ('cnpgen {command}' takes it)"
@@ -237,6 +242,7 @@ def stored_problem(
     if "problem" not in attributes:
         return None
     name = _text(path, attributes, "problem")
+    # A file from another place must not make this process read any path that it names.
     if not _is_beside(path, name):
         if not required:
             return None
@@ -289,6 +295,8 @@ def _stored_record(path: Path, attributes: Mapping[str, Any]) -> ProblemRecord:
     try:
         same = (
             record.comparable_sha256 == _text(path, attributes, "problem_sha256")
+            # The trajectory is parsed here, so that an invalid one is reported as
+            # damage of the file.
             and record.trajectory.degree > 0
         )
     except RecipeError as error:
@@ -341,6 +349,7 @@ def _statuses(
 
     Unknown names become UNKNOWN.
     """
+    # Without names in the file, its numbers are those of PlanStatus.
     known = {int(status): status for status in PlanStatus}
     if "flag_values" in attributes and "flag_meanings" in attributes:
         names = {status.name.lower(): status for status in PlanStatus}
@@ -409,6 +418,7 @@ def check_replaceable(path: Path) -> None:
 
 def _datasets(plans: Plans) -> dict[str, NDArray[Any]]:
     """Return the stored datasets, in order and in their stored types."""
+    # Columns are sorted: the order of a mapping does not change the bytes.
     floats = plans.boundary.arrays() | dict(sorted(plans.columns.items()))
     floats |= {
         "path_control_points": plans.path_control_points,
@@ -445,6 +455,7 @@ def _write_attributes(item: Any, attributes: Mapping[str, Any]) -> None:
     for name, value in attributes.items():
         if not isinstance(value, str):
             item.attrs[name] = value
+        # HDF5 has no texts of length zero; empty values are left out.
         elif value not in {"", "[]"}:
             data = value.encode()
             item.attrs[name] = np.array(data, h5py.string_dtype("utf-8", len(data)))

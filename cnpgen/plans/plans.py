@@ -75,6 +75,8 @@ class Plans:
     def __post_init__(self) -> None:
         integer("degree", self.degree, least=3, most=MAX_DEGREE)
         try:
+            # The first error in shapes is enough to raise; types are only checked when
+            # something fails.
             wrong = next(_errors(self), None)
         except (AttributeError, TypeError, IndexError):
             check_fields(self)
@@ -82,6 +84,8 @@ class Plans:
             raise
         if wrong is not None:
             check_fields(self)
+            # The message compares each field with the number of plans that most fields
+            # have.
             argument, text = next(_errors(self, _rows(self)))
             raise UsageError(text, concerns=argument)
 
@@ -155,6 +159,7 @@ class Plans:
                 f"must be one number or one for each of {len(self)} plans, got {time!r}",
                 argument="time",
             ) from error
+        # Negated, so that nan counts as outside.
         outside = ~((times >= 0) & (times <= self.duration))
         if outside.any():
             row = int(outside.argmax())
@@ -178,6 +183,7 @@ class Plans:
         """
         which = _checked(which, len(self))
         if isinstance(which, np.ndarray):
+            # An index array may repeat plans without limit.
             numbers_per_plan = self.path_control_points[0].size if len(self) else 1
             check_memory("which", len(which), len(which) * numbers_per_plan)
         return replace(
@@ -278,6 +284,8 @@ def make_plans(
 
 def check_made(plans: Plans) -> None:
     """Raise UsageError for a plan without control points."""
+    # Boundary problems have nan in all control points; a single nan is a plan that is
+    # not finite.
     waiting = np.isnan(plans.path_control_points).all(axis=(1, 2))
     if waiting.any():
         raise UsageError(
@@ -296,6 +304,8 @@ def screen(plans: Plans) -> NDArray[np.uint8]:
     parts = [*plans.boundary.arrays().values(), plans.rate_control_points]
     finite = np.isfinite(plans.path_control_points).all(axis=(1, 2))
     finite &= np.all([np.isfinite(part).all(axis=1) for part in parts], axis=0)
+    # The duration, the integral of 1 / r(s), is finite only if the rate is positive
+    # throughout.
     found = np.where(
         np.isfinite(plans.duration), PlanStatus.UNKNOWN, PlanStatus.NOT_FORWARD
     )
@@ -316,6 +326,8 @@ def _integers(
         ) from error
     low, high = np.iinfo(kind).min, np.iinfo(kind).max
     if found.size and not (
+        # astype wraps numbers that do not fit, hence the comparison with the original
+        # values.
         found.dtype.kind in "iu" and low <= found.min() and found.max() <= high
     ):
         raise UsageError(
@@ -355,6 +367,7 @@ def _checked(which: Any, plans: int) -> slice | NDArray[Any]:
                 f"a mask must have shape ({plans},) as there are {plans} plans, got {found.shape}",
                 concerns="which",
             )
+    # Negative numbers count from the end, as of lists.
     elif found.size and not -plans <= int(found.min()) <= int(found.max()) < plans:
         wrong = int(found.max() if found.max() >= plans else found.min())
         raise PlanIndexError(
@@ -415,6 +428,8 @@ def _spline_errors(plans: Plans, rows: int) -> Iterator[tuple[str, str]]:
             "path_control_points",
             f"path_control_points has {n} joints, but {plans.problem.name!r} plans {joints}: got shape {path.shape}",
         )
+    # The conditions at both ends fix control points, of which a path needs at least as
+    # many.
     min_count = plans.boundary.min_control_points(degree)
     if points < min_count:
         yield (
@@ -463,6 +478,8 @@ def _rows(plans: Plans) -> int:
         plans.status,
     ]
     fields += plans.columns.values()
+    # The most frequent length is probably the intended one: the error then names the
+    # field that differs.
     return Counter(
         len(field) if getattr(field, "ndim", 0) else 0 for field in fields
     ).most_common(1)[0][0]

@@ -66,6 +66,7 @@ def _are_usual(robot: Robot, states: Sequence[NDArray[Any]]) -> bool:
     shape = (len(states[0]), robot.n)
     if any(values.shape != shape for values in states):
         return False
+    # Columns are in the order of state_bounds; later ones may be missing.
     values = np.concatenate(states, axis=1)
     low, high = robot.state_bounds
     width = values.shape[1]
@@ -77,6 +78,7 @@ def _are_usual(robot: Robot, states: Sequence[NDArray[Any]]) -> bool:
 def _users_level() -> int:
     """Return the ``stacklevel`` with which a warning refers to the user's line, not to this package."""
     level, frame = 0, inspect.currentframe()
+    # Frames of this package and of context managers are skipped.
     while frame is not None and str(frame.f_globals.get("__name__")).partition(".")[
         0
     ] in {"cnpgen", "contextlib"}:

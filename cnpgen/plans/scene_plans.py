@@ -46,6 +46,7 @@ def capacity_of(scenes: Sequence[SceneProblem]) -> dict[str, int]:
         shape: max((count[shape] for count in counts), default=0)
         for shape in (*KINDS, *meshes)
     }
+    # Each mesh is a shape of its own, whose places no other obstacle can use.
     steps = {shape: OBSTACLES_PER_STEP if shape in KINDS else 1 for shape in most}
     return {
         shape: -(-count // steps[shape]) * steps[shape]
@@ -86,6 +87,7 @@ def scene_plans(
     full = with_capacity(problem, capacity_of(scenes) if capacity is None else capacity)
     record = record_problem(full)
     robot = open_problem(record)[1]
+    # The start places the frames of links, so it is needed before the scene is placed.
     start = np.array([start_state(scene, robot) for scene in scenes])
     scenes = [
         placed_scene(scene, robot, q) for scene, q in zip(scenes, start, strict=True)
@@ -187,6 +189,8 @@ def _within_limits(scene: SceneProblem, robot: Robot) -> Array:
         return states
     below, above = goal_tolerances(scene, robot)
     goals = states[:, columns]
+    # The nearest state within the limits, then the nearest to it within the tolerances
+    # of the goal.
     clipped = np.clip(goals, robot.position_lower, robot.position_upper)
     states[:, columns] = np.clip(clipped, goals - below, goals + above)
     return states
@@ -199,10 +203,12 @@ def _check_still_joints(scene: SceneProblem, robot: Robot) -> None:
         for each in (scene.request.goal_below, scene.request.goal_above)
     )
     shift = scene.start_q - scene.goal_q
+    # A joint that stays at the start meets the goal if -below <= start - goal <= above.
     violation = np.maximum(shift - above, -shift - below)
     for index, name in enumerate(scene.joint_names):
         if name in robot.joint_names or not len(scene.goal_q):
             continue
+        # One goal state that needs no motion of the joint is enough.
         if violation[:, index].min() > JOINT_TOLERANCE_RAD:
             raise SceneError(
                 f"{scene.place}: the goal moves the joint {name!r} from {scene.start_q[index]:g}"
@@ -241,6 +247,7 @@ def joint_order(scene: SceneProblem, robot: Robot, states: Array, end: str) -> A
             f"{scene.place}: {robot.joint_names[joint]} is {value:.4f} {unit} at the {end}, outside of its limits"
             f" [{low:.4f}, {high:.4f}] {unit}{suggested_unit(value, unit, low, high)}"
         )
+    # Violations up to the tolerance are rounding, and removed.
     return np.clip(states, robot.position_lower, robot.position_upper)
 
 
@@ -254,7 +261,9 @@ def poses_of_scene(problem: Problem, fixed: int, scene: SceneProblem) -> Array:
         if not free.get(shape_of(obstacle)):
             text = f"{scene.place} has more obstacles of the kind {obstacle.kind} than the capacity"
             raise UsageError(text, concerns="capacity")
+        # The first free place of the shape: places that remain stay parked.
         own, part = place_obstacles([obstacle]), slices[free[shape_of(obstacle)].pop(0)]
+        # Places of boxes have rotation matrices, also for an obstacle that is upright.
         if obstacle.kind == "box":
             box = primitives_of([obstacle], own)
             own = np.concatenate(
@@ -273,6 +282,7 @@ def with_wider_capacity(
         with_capacity(problem, capacity),
     )
     poses = np.tile(place_obstacles(after.obstacle), (len(plans), 1))
+    # Parked obstacles have equal names in both capacities: places are matched by name.
     positions = {
         obstacle.name: part
         for obstacle, part in zip(

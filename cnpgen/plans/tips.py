@@ -24,6 +24,8 @@ def correct_tips(plans: Plans, *, where: str = "") -> Plans:
         name, recorded = f"{end}_xyz", plans.columns[f"{end}_xyz"]
         tip = plans.problem.tip_positions(getattr(plans.boundary, f"{end}_q"))
         off = np.linalg.norm(recorded - tip, axis=1)
+        # Negated, so that a recorded nan counts as wrong; joints that are not finite
+        # have no tip.
         wrong = ~(off <= TIP_TOLERANCE_M) & np.isfinite(tip).all(axis=1)
         if wrong.any():
             first = int(np.argmax(wrong))

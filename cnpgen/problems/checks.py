@@ -90,6 +90,8 @@ class ProblemTables:
         named = self.robot.get("geometry")
         if isinstance(named, str):
             return named
+        # Without obstacles and self-clearance no distance is measured, so that the
+        # collision geometry need not be read.
         something_to_hit = bool(
             tables(self.table, "obstacle") or self.constraints("self-clearance")
         )
@@ -126,6 +128,8 @@ def problem_errors(raw: ProblemTables) -> Iterator[str]:
     yield from _repeated(raw, "constraint", "use")
     yield from _repeated(raw, "obstacle", "name")
     uses = {str(each.get("use")) for _, each in tables(table, "constraint")}
+    # Built-in constraints that use obstacles; contacts of the held object count only if
+    # there is one.
     using = (
         {"robot-clearance", "object-contact"}
         if "object" in table
@@ -184,6 +188,7 @@ def _robot_errors(raw: ProblemTables) -> Iterator[str]:
     if text := unread_xacro(raw.urdf, path):
         yield (where / "urdf").message(text)
         return
+    # A joint without a type counts as fixed.
     moving = [
         joint.get("name", "")
         for joint in raw.urdf.iter("joint")
@@ -221,6 +226,7 @@ def _shape_errors(
     meshes = dict.fromkeys(
         mesh.get("filename", "") for each in elements for mesh in each.iter("mesh")
     )
+    # Inline meshes (data:) are in the text itself and need no file.
     for name in (each for each in meshes if not each.startswith("data:")):
         try:
             find_named_file(name, raw.urdf_path or raw.folder, raw.packages)
@@ -289,6 +295,7 @@ def limit_errors(problem: Problem, raw: ProblemTables) -> Iterator[str]:
         # Loading the robot raises the error.
         return
     for key, rows in given.items():
+        # One number of a limit holds for all joints.
         per_row = rows * (len(spec.joints) if len(rows) == 1 else 1)
         for name, values, (low, high, unit) in zip(
             spec.joints, per_row, plausible[key], strict=False
@@ -316,8 +323,11 @@ def _plausible_limit(joint: ElementTree.Element, key: str) -> tuple[float, float
     )
     if key == "position":
         lower, upper = (number_in(limit, end, 0.0) for end in ("lower", "upper"))
+        # The range of the URDF, widened about its center: ranges may exceed it, but not
+        # as degrees exceed radians.
         center, half = (lower + upper) / 2, MAX_RANGE_RATIO * (upper - lower) / 2
         return center - half, center + half, unit
+    # Accelerations are compared with the default of the problem, a_max = rate * v_max.
     rate = LimitSpec.acceleration_rate if key == "acceleration" else 1.0
     return 0.0, MAX_LIMIT_RATIO * rate * number_in(limit, "velocity", 0.0), unit
 
@@ -358,6 +368,7 @@ def _locked_outside(
     """
     for joint in joints:
         limit, name = joint.find("limit"), joint.get("name", "")
+        # A mimic joint follows another joint, and continuous joints have no limits.
         movable = (
             joint.get("type") in ("revolute", "prismatic")
             and joint.find("mimic") is None

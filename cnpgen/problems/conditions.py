@@ -29,6 +29,7 @@ def symbolic_needs(condition: Condition, *derivatives: Any) -> int:
     import casadi as ca
 
     g = ca.SX(ca.vertcat(*condition.g))
+    # From the highest derivative down: the first that g depends on is its order.
     orders = range(len(derivatives), 0, -1)
     return next(
         (order for order in orders if ca.depends_on(g, derivatives[order - 1])), 0
@@ -56,6 +57,7 @@ def measured_needs(
     rest = [np.zeros(robot.n) for _ in limits]
     changed = []
     for order, limit in enumerate(limits):
+        # All other derivatives stay zero, so that a change belongs to this order.
         moving = [
             limit + np.nan,
             *(share * limit * _MIXED[: robot.n] for share in _SHARES),
@@ -110,6 +112,7 @@ def equality_residuals(robot: Robot, problem: Problem) -> Any:
     rows = [
         _violation(value, float(low), float(high))
         for condition, needs in conditions_with_needs(problem, state, columns[1:-1])
+        # Only conditions of positions can be met by a change of q.
         if needs == 0 and (condition.is_equality or condition.projected)
         for value, low, high in zip(
             condition.g, condition.lower, condition.upper, strict=True
@@ -130,6 +133,7 @@ def _violation(value: Any, low: float, high: float) -> Any:
 
     if low == high:
         return value - low
+    # min(g - low, 0) + max(g - high, 0); an infinite bound adds no term.
     below = ca.fmin(value - low, 0) if np.isfinite(low) else 0.0
     return below + (ca.fmax(value - high, 0) if np.isfinite(high) else 0.0)
 

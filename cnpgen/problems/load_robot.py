@@ -56,12 +56,16 @@ def load_robot(problem: Problem) -> Robot:
         rated = _given(limits.velocity, "velocity", model.velocityLimit)
         torque = _given(limits.torque, "torque", model.effortLimit)
         velocity = limits.velocity_scale * rated
+        # Default: a_max = min(rate * v_max, cap, limit of the URDF 1.2); the problem
+        # may replace it.
         most = np.minimum(limits.acceleration_rate * velocity, limits.acceleration_cap)
         most = np.minimum(most, _rates(joints, "acceleration"))
         acceleration = _given(limits.acceleration, "acceleration", most)
+        # Default: j_max = min(JERK_RATE * a_max, limit of the URDF 1.2).
         most = np.minimum(JERK_RATE * acceleration, _rates(joints, "jerk"))
         jerk = _given(limits.jerk, "jerk", most)
         drive = _drive(problem, joints, limits.torque_scale, torque)
+    # Ranges are scaled about their center c: c +- scale * (upper - lower) / 2.
     center = (
         np.array(model.upperPositionLimit) + np.array(model.lowerPositionLimit)
     ) / 2
@@ -105,6 +109,7 @@ def load_robot(problem: Problem) -> Robot:
             # Expensive to build again.
             built_model=robot.model,
         )
+    # Stored problems were accepted before, possibly by earlier rules.
     if not problem.is_stored:
         _check_sizes(problem, robot)
     return robot
@@ -146,10 +151,14 @@ def _drive(
     """
     spec, none = problem.drive, np.zeros(len(joints))
     uses = spec.urdf_dynamics == "use"
+    # Friction of the URDF counts only with urdf_dynamics = "use"; otherwise the factor
+    # is zero.
     damping, friction = (
         np.array([getattr(joint, name) * uses for joint in joints])
         for name in ("damping", "friction")
     )
+    # Inertia of a rotor seen at the joint: J = ratio^2 * J_rotor, unless the armature
+    # itself is stated.
     rotor = _given(spec.rotor_inertia, "rotor_inertia", none, "drive")
     ratio = _given(spec.gear_ratio, "gear_ratio", none, "drive")
     terms = {
@@ -181,6 +190,8 @@ def _lines(spec: DriveSpec, none: Array, scale: float) -> Iterator[SpeedLine]:
     for number, line in enumerate(spec.line, 1):
         table = f"drive.line {number}"
         torque = scale * _given(line.torque, "torque", none, table)
+        # The line from (0, torque) to (speed, 0): its slope is torque / speed [N m
+        # s/rad].
         speed = _given(line.speed, "speed", none, table)
         yield SpeedLine(torque, torque / speed, line.quadrants == "motoring")
 
@@ -221,6 +232,8 @@ def _errors(problem: Problem, robot: Robot) -> Iterator[str]:
     if any(isinstance(constraint, JointTorque) for constraint in problem.constraint):
         yield from _weightless(robot)
     yield from (errors := list(_position_errors(problem, robot)))
+    # A home configuration can only be compared with limits that are ordered and in rad
+    # or m.
     if not errors:
         yield from _home_errors(problem, robot)
 
@@ -232,6 +245,7 @@ def _drive_errors(problem: Problem, robot: Robot) -> Iterator[str]:
         return
     for index, name in enumerate(robot.joint_names):
         friction, limit = drive.resting_friction[index], drive.resting_limit[index]
+        # At rest the motor must first exceed the dry friction.
         if friction >= limit:
             unit = unit_of(robot.units("N m"), index)
             text = f"friction of {friction:.4g} {unit} at rest leaves nothing of the motor's limit of {limit:.4g} {unit}"
@@ -263,6 +277,7 @@ def _position_errors(problem: Problem, robot: Robot) -> Iterator[str]:
 
 def _weightless(robot: Robot) -> Iterator[str]:
     """Yield error messages for joints that move no mass, which have no torques to limit."""
+    # Joint i moves the masses of all joints from i to the tip: sum over k >= i of m_k.
     mass = np.cumsum([joint.mass for joint in robot.chain.joints][::-1])[::-1]
     for name in np.array(robot.joint_names)[mass <= 0].tolist():
         text = "no link that it moves has a mass, so that its torque means nothing: give the links an <inertial>"
@@ -275,9 +290,12 @@ def _home_errors(problem: Problem, robot: Robot) -> Iterator[str]:
     if base.shape != low.shape:
         yield f"{problem.path}: robot.base: needs {robot.n} values, one per planned joint, got {base.size}"
         return
+    # One message, for the joint with the largest violation.
     worst = int(np.argmax(np.maximum(low - base, base - high)))
     if not low[worst] <= base[worst] <= high[worst]:
         unit = unit_of(robot.units("rad"), worst)
+        # Degrees are suggested only for values beyond a full turn, which radians hardly
+        # reach.
         hint = (
             suggested_unit(base[worst], unit, low[worst], high[worst])
             if abs(base[worst]) > 2 * np.pi
@@ -289,6 +307,7 @@ def _home_errors(problem: Problem, robot: Robot) -> Iterator[str]:
         )
     for table in (each for each in problem.constraint if isinstance(each, Table)):
         height = float(robot.tip_positions(base[None])[0, 2])
+        # A start may be below the table by its band, any state by the tolerance.
         if height < table.z - max(table.band, table.tolerance):
             text = f"the tip is {table.z - height:.3g} m below the table, at z = {height:.4g} m, expected {table.z:g} m"
             yield f"{problem.path}: robot.base: {text} or more: is the tip the frame that you mean, and 'z' its height?"
@@ -312,10 +331,15 @@ def _robot_errors(robot: Robot, problem: Problem) -> Iterator[str]:
         remedy = "lengths of a URDF are in m, not in mm: convert the <origin xyz> of its joints"
         yield f"the arm is {reach:.3g} m long, expected {MIN_REACH_M:g} to {MAX_REACH_M:g} m; {remedy}"
         return
+    # The last joint carries the payload, too, which is compared with the arm
+    # separately.
     joints = robot.chain.joints if problem.payload is None else robot.chain.joints[:-1]
     for name, joint in zip(robot.joint_names, joints, strict=False):
+        # Nearly massless links have placeholder inertias, which do not show the unit.
         if joint.mass < MIN_MASS_KG:
             continue
+        # trace(I) = 2 * integral of r^2 dm, so that the radius of gyration is
+        # sqrt(trace(I) / (2 m)).
         center, gyration = (
             np.linalg.norm(joint.com),
             np.sqrt(max(np.trace(joint.inertia), 0.0) / (2 * joint.mass)),
@@ -332,6 +356,8 @@ def _link_errors(problem: Problem, robot: Robot, reach: float) -> Iterator[str]:
         return
     sizes: dict[str, float] = {}
     for part in robot.shape.convex_parts:
+        # Longest edge of the bounding box of the vertices, which are inflated by the
+        # radius.
         size = float(np.ptp(part.vertices, axis=0).max()) + 2 * part.radius
         sizes[part.link] = max(size, sizes.get(part.link, 0.0))
     large = {
@@ -388,7 +414,9 @@ def _problem_errors(robot: Robot, problem: Problem) -> Iterator[str]:
     reach, payload = robot.reach, problem.payload
     mass = sum(joint.mass for joint in robot.chain.joints)
     if payload is not None:
+        # Masses of the chain include the payload.
         arm, distance = mass - payload.mass, float(np.linalg.norm(payload.centre))
+        # Radius of gyration, sqrt(trace(I) / (2 m)) [m].
         gyration = float(np.sqrt(np.trace(payload.inertia_matrix) / (2 * payload.mass)))
         if arm > MIN_ARM_KG and payload.mass > MAX_PAYLOAD_RATIO * arm:
             yield f"payload.mass: is {payload.mass:g} kg, where the arm has {arm:.3g} kg: masses are in kg, not in g"
@@ -400,6 +428,7 @@ def _problem_errors(robot: Robot, problem: Problem) -> Iterator[str]:
         distance = _distance(obstacle)
         if (
             distance > MAX_OBSTACLE_RATIO * reach
+            # Obstacles that samples place are parked far away by default.
             and obstacle.position != PARKED_POSITION_M
         ):
             text = f"{obstacle.name!r} is {distance:.3g} m away, where the arm is {reach:.3g} m long"
@@ -409,6 +438,8 @@ def _problem_errors(robot: Robot, problem: Problem) -> Iterator[str]:
 def _distance(obstacle: Obstacle) -> float:
     """Return a lower bound of the distance of an obstacle from the origin of the world [m]."""
     if obstacle.position is not None and not obstacle.mesh:
+        # The sum of all lengths bounds the extent from the center, whatever the shape
+        # and its rotation.
         lengths = [
             *(obstacle.size or ()),
             obstacle.radius or 0.0,
@@ -416,6 +447,8 @@ def _distance(obstacle: Obstacle) -> float:
             obstacle.length or 0.0,
         ]
         return float(np.linalg.norm(obstacle.position) - sum(lengths))
+    # Distance of the origin from a range [low, high] of one coordinate: max(low, -high,
+    # 0).
     sides = [
         max(each.low, -each.high, 0.0)
         for each in (obstacle.x, obstacle.y)

@@ -81,6 +81,8 @@ class Centrifugal(ObjectiveTerm):
         from cnpgen.kernels.symbolic.linalg import dot
 
         v, a = state.tip_velocity, state.tip_acceleration
+        # a - v (v . a) / |v|^2 is the part of a across v; the constant avoids a
+        # division by zero at rest.
         along = dot(v, a) / (sum(x * x for x in v) + MIN_SQUARED_TIP_SPEED_M2_S2)
         return [y - along * x for x, y in zip(v, a, strict=True)]
 
@@ -91,6 +93,8 @@ class Centrifugal(ObjectiveTerm):
         from cnpgen.kernels.symbolic.linalg import cross, dot
 
         v = state.tip_velocity
+        # |v x a| / |v| is the norm of the part of a across v, so that both forms have
+        # the same size.
         across = cross(v, state.recursive_tip_acceleration)
         speed = ca.sqrt(dot(v, v) + MIN_SQUARED_TIP_SPEED_M2_S2)
         return [x / speed for x in across]
@@ -106,6 +110,7 @@ class Effort(ObjectiveTerm):
         """Return the torques of the inverse dynamics, or of the motors, as fractions of their planning limits."""
         robot = state.robot
         drive = robot.drive
+        # With drives, the motors' torques are compared with the motors' limits.
         limits = robot.torque_limit if drive is None else drive.torque_limit
         return [
             tau / float(limit)
@@ -171,6 +176,8 @@ class TipReference(ObjectiveTerm):
         for first, second in zip(self.points, self.points[1:], strict=False):
             along = [b - a for a, b in zip(first, second, strict=True)]
             offset = [x - a for x, a in zip(tip, first, strict=True)]
+            # Nearest point of a segment: a + t d with t = (x - a) . d / |d|^2, clipped
+            # to [0, 1].
             fraction = ca.fmin(
                 ca.fmax(dot(offset, along) / dot(along, along), 0.0), 1.0
             )
@@ -179,11 +186,15 @@ class TipReference(ObjectiveTerm):
             if best is None:
                 best, nearest = distance, point
                 continue
+            # The nearest point of all segments so far, selected without branches, as SX
+            # needs it.
             nearest = [
                 ca.if_else(distance < best, x, y)
                 for x, y in zip(point, nearest, strict=True)
             ]
             best = ca.fmin(best, distance)
+        # The nearest point is constant for derivatives: the gradient of the distance is
+        # the same (envelope theorem).
         return [x - state.freeze(y) for x, y in zip(tip, nearest, strict=True)]
 
 
@@ -213,6 +224,7 @@ def read_objective(text: str) -> tuple[ObjectiveTerm, ...] | None:
             raise UsageError(
                 "the weight of time must be above 0: without it motions may be arbitrarily slow"
             )
+        # w T + sum w_i J_i and T + sum (w_i / w) J_i have the same minimum.
         return tuple(_term(name, weight / time) for name, weight in weights.items())
 
 
@@ -220,6 +232,7 @@ def _weight(name: str, text: str) -> float:
     try:
         weight = float(text)
     except ValueError:
+        # Text that is no number has the error of a negative number.
         weight = -1.0
     if not 0 <= weight < float("inf"):
         raise UsageError(

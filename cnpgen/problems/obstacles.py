@@ -53,11 +53,14 @@ def scene_of(
         obstacle_poses: Poses and sizes of the obstacles of each sample, shape (N,
             width), in place of the problem's.
     """
+    # The object is upright and centered at the tip: its bottom is half its height
+    # below.
     half = 0.0 if problem.object is None else problem.object.size[2] / 2
     parts, constraint = [], problem.scene_constraint
     if problem.obstacle:
         bottoms = {"start": start_xyz[:, 2] - half, "goal": goal_xyz[:, 2] - half}
         parts.append(place_obstacles(problem.obstacle, bottoms))
+    # Parameters without ranges have no columns.
     if not problem.parameters:
         parameters = None
     elif parameters is None:
@@ -73,6 +76,7 @@ def scene_of(
             raise UsageError(
                 f"positions and velocities must have one shape (N, 3), got {shapes}"
             )
+        # The puck lies on the table, whose frame differs from sample to sample.
         if (frame := table_frame_of(problem, parameters)) is not None:
             goal_xyz, goal_velocity = (
                 frame.to_table(goal_xyz),
@@ -107,6 +111,7 @@ def goal_velocities(
     if not len(goal_q):
         return np.empty((0, 3))
     world = PathWorld(robot)
+    # Accelerations do not affect velocities of the tip.
     world.set_path(goal_q.T, goal_dq.T, np.zeros(goal_q.T.shape), np.empty(0))
     return world.tip_velocity.T
 
@@ -135,6 +140,7 @@ def with_capacity(problem: Problem, capacity: Capacity) -> Problem:
         )
     if error:
         raise UsageError(f"the problem {problem.name!r} {error}", concerns="problem")
+    # The order of obstacles does not depend on the order of the mapping.
     shapes = [*KINDS, *sorted(capacity.keys() - set(KINDS))]
     parked = [
         _parked(shape, index)
@@ -146,6 +152,7 @@ def with_capacity(problem: Problem, capacity: Capacity) -> Problem:
 
 def _parked(kind: str, index: int) -> Obstacle:
     if kind not in KINDS:
+        # The corners of a mesh are its kind; a part of their hash keeps names short.
         name = f"mesh {hashlib.sha256(kind.encode()).hexdigest()[:8]} {index}"
         return Obstacle(
             name=name,

@@ -169,6 +169,8 @@ class Problem:
 
     def replaced(self, **fields: Any) -> "Problem":
         """Return the problem with other fields and the same text of the URDF, which is expensive to read again."""
+        # Copies of copies refer to the first problem, so that the chain is one step
+        # long.
         return dataclasses.replace(self, same_robot=self.same_robot or self, **fields)
 
     @property
@@ -217,6 +219,7 @@ class Problem:
                 f"drive.{limits[0]}",
                 "limits motors, and no constraint joint-torque of the problem applies it",
             )
+        # The columns of a scene have one block for such values.
         if sum(constraint.scene_width > 0 for constraint in self.constraint) > 1:
             yield (
                 "constraint",
@@ -265,6 +268,8 @@ class Problem:
         for name, span, value in zip(
             self.parameters.names, self.parameters.ranges, nominal, strict=True
         ):
+            # Samples without parameters use the nominal value, which must be a valid
+            # one.
             if not span.low <= value <= span.high:
                 yield (
                     "parameters",
@@ -290,6 +295,7 @@ class Problem:
                 for end in ("low", "high")
             )
             sides: Range = getattr(tables[0], side)
+            # The worst sample has the highest low side and the lowest high side.
             if (low.high if low else sides.low) >= (high.low if high else sides.high):
                 yield (
                     "parameters",
@@ -304,6 +310,7 @@ class Problem:
     @property
     def object_size(self) -> tuple[float, float, float] | None:
         """Edge lengths of the held object [m], None if nothing is held."""
+        # The code of a plug-in may use names, poses and sizes as constants.
         return None if self.object is None else self.object.size
 
     @property
@@ -352,6 +359,7 @@ class Problem:
         """Columns of the values of a scene."""
         constraint = self.scene_constraint
         obstacles = pose_width(self.obstacle)
+        # Order: poses of obstacles, values of the constraint, parameters.
         own = obstacles + (0 if constraint is None else constraint.scene_width)
         end = own + len(self.parameters)
         return SceneColumns(slice(obstacles), slice(obstacles, own), slice(own, end))
@@ -380,6 +388,7 @@ class Problem:
 
         For r(s) it is one less.
         """
+        # p, p', p'' determine accelerations; jerks need p''', too.
         return 4 if self.uses_jerk else 3
 
     @property
@@ -408,6 +417,7 @@ class Problem:
             RecipeError: The URDF, a mesh or the SRDF cannot be read, or is not UTF-8,
                 or a joint cannot be locked.
         """
+        # A stored text has been processed by all steps below.
         if self.read_urdf_text is not None:
             return self.read_urdf_text
         if self.same_robot is not None:
@@ -421,10 +431,14 @@ class Problem:
                 check_elements(urdf_tree(text), self.urdf_path)
         text = with_locked_joints(text, positions, is_stored=self.is_stored)
         text = with_point_masses(text)
+        # Meshes need not exist where no constraint uses the geometry.
         if not self.uses_link_geometry:
             return text
+        # The geometry of a stored problem is in its file, with the additions that were
+        # made then.
         if not self.is_stored:
             text = with_collision_geometry(text, spec.visual_links, spec.skipped_meshes)
+        # Only decompositions into several parts are kept in the cache.
         keep = kept_folder() if spec.convex_parts > 1 else None
         text = with_inline_meshes(
             text,
@@ -444,8 +458,10 @@ class Problem:
         if self.payload is not None:
             ignored = (
                 *ignored,
+                # Links that hold the payload touch it in every state.
                 *((link, PAYLOAD) for link in self.payload.touch_links),
             )
+        # Last: the ignored pairs may name the link of the payload.
         return with_ignored_pairs(text, ignored) if ignored else text
 
     @cached_property
@@ -473,24 +489,28 @@ class Problem:
         ):
             return None
         content = without_labels(to_dict(self, label=_all_of))
+        # The name does not affect kernels, but is part of the identity.
         content = {key: value for key, value in content.items() if key != "name"}
         content["obstacle"] = [
             _structure_of(obstacle) for obstacle in content["obstacle"]
         ]
         text = json.dumps(content, sort_keys=True)
         return hashlib.sha256(
+            # The prefix keeps the hash apart from an identity with the same content.
             b"structure" + text.encode() + self.urdf_text.encode()
         ).hexdigest()
 
 
 def _structure_of(obstacle: Mapping[str, Any]) -> dict[str, Any]:
     """Return the keys of a resolved obstacle that kernels contain as constants: all but name, pose and sizes."""
+    # Kernels contain the ranges of an obstacle as constants.
     if obstacle.get("x") is not None or obstacle.get("y") is not None:
         return {
             key: value
             for key, value in obstacle.items()
             if key not in {"name", "top", "below"}
         }
+    # Turned obstacles have other symbolic distances than upright ones.
     turned = any(obstacle.get("rotation") or ())
     return {key: obstacle.get(key) for key in ("kind", "mesh", "scale")} | {
         "turned": turned
@@ -517,6 +537,7 @@ def kept_folder() -> Path | None:
         make_private_folder(folder)
     except (OSError, MachineError):
         return None
+    # A cache that other users may write to could contain their shapes.
     return None if trust_problem(folder) else folder
 
 
@@ -530,6 +551,7 @@ def resolved(recipe: object) -> dict[str, Any]:
 
 def _use(obj: object) -> dict[str, str]:
     """Label a stage or a constraint with the name of its kind and, for a plug-in, its package and code."""
+    # Other objects, such as ranges, need no label.
     group = registry.group_of(type(obj))
     if not group:
         return {}

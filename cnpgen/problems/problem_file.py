@@ -69,6 +69,8 @@ def _read_behind(path: Path, errors: list[str]) -> Problem | None:
     if table is None:
         return None
     kinds: tuple[Kind, ...] = ("pipeline", "problem")
+    # A dataset names its pipeline, a pipeline its problem; a file with neither is a
+    # problem.
     key = next((kind for kind in kinds if kind in table), None)
     if key is None:
         return read_problem(path, errors)
@@ -93,9 +95,12 @@ def read_problem(path: Path, errors: list[str]) -> Problem | None:
         return None
     raw = ProblemTables(table, where := RecipeLocation(str(path)), path.parent)
     problem = parse(Problem, table, where=where, errors=errors, readers=KIND_READERS)
+    # Errors of the tables are added to those of the parser, so that all are reported
+    # together.
     before = len(errors)
     errors.extend(problem_errors(raw))
     obstacles = () if problem is None else _with_meshes(problem, path, where, errors)
+    # Limits are compared with the URDF only if the robot's tables are valid.
     if problem is None or len(errors) > before:
         return None
     errors.extend(limit_errors(problem, raw))
@@ -104,6 +109,7 @@ def read_problem(path: Path, errors: list[str]) -> Problem | None:
         undecided = undecided_friction(raw.urdf, problem.robot.joints)
         if undecided and problem.version > 1:
             errors.append(f"{path}: drive.urdf_dynamics: missing; {undecided}")
+        # Files of version 1 ignored friction silently: an error would reject them.
         elif undecided:
             message = f"{path}: friction of the URDF is ignored; {undecided}"
             warnings.warn(message, UserWarning, stacklevel=3)
@@ -133,6 +139,7 @@ def _with_meshes(
                 mesh = inline_mesh(
                     find_named_file(each.mesh, path, packages), np.array(each.scale)
                 )
+                # The corners are scaled already.
                 obstacle = replace(each, mesh=mesh, scale=Obstacle.scale)
             except RecipeError as error:
                 errors += [
@@ -168,6 +175,7 @@ def names_of_stored_files(folder: Path) -> Iterator[None]:
     try:
         yield
     except RecipeError as error:
+        # The temporary folder no longer exists when the user reads the message.
         errors = tuple(line.replace(f"{folder}{os.sep}", "") for line in error.errors)
         if errors == error.errors:
             raise
@@ -197,6 +205,7 @@ def restoring_reader(urdf: str, path: Path) -> Reader:
     def read(value: Any, where: RecipeLocation, errors: list[str]) -> Problem | None:
         if not isinstance(value, dict) or not isinstance(value.get("robot"), dict):
             raise ValueError("expected the table of a problem, with a robot")  # noqa: TRY004 - as of other errors
+        # Keys of files would name files of the machine that stored the problem.
         robot = {
             key: entry for key, entry in value["robot"].items() if key not in FILES
         }
@@ -220,6 +229,7 @@ def _meshes_on_disk(
     text = "names the mesh {}, expected its corners in the text"
     # Loading the robot raises the error.
     with suppress(ValueError):
+        # One mesh file is enough to refuse the URDF.
         for name in mesh_files(urdf)[:1] if problem.uses_link_geometry else ():
             yield (where / "robot" / "urdf").message(text.format(show(name)))
     for index, each in enumerate(problem.obstacle):

@@ -193,6 +193,7 @@ class ProblemRecord(StoredProblem):
         ):
             problem = restore_problem(self.content, self.urdf, Path(folder))
             # The stored text contains meshes and pairs already.
+            # Reading the URDF again would add them twice.
             yield replace(problem, read_urdf_text=self.urdf)
 
     @checked_arguments
@@ -223,6 +224,7 @@ def with_control_points(
         for key, count in counts.items()
         if count not in {None, record.content["trajectory"][key]}
     }
+    # The record keeps its bytes, and with them its hash.
     if not changed:
         return record
     content = {
@@ -249,6 +251,7 @@ def with_objective(record: ProblemRecord, objective: str) -> ProblemRecord:
     terms = read_objective(objective)
     if terms is None:
         return record
+    # The new terms replace all of the problem's, the centrifugal weight included.
     content = {**record.content, "objective": resolved(Objective(term=terms))}
     return ProblemRecord(
         json.dumps(plain(content), ensure_ascii=False, allow_nan=False), record.urdf
@@ -283,8 +286,10 @@ def extrapolated(problem: Problem, parameters: ArrayLike) -> Problem:
         # Errors of the shape are those of the reader.
         return problem
     wider = ranges.widened(rows.reshape(-1, len(ranges)))
+    # The name must mark a problem only if its ranges differ.
     if not ranges.out_of_range(rows.reshape(-1, len(ranges))):
         return problem
+    # A problem that is widened twice is marked once.
     name = problem.name.removesuffix(EXTRAPOLATED) + EXTRAPOLATED
     return replace(problem, parameters=wider, name=name)
 
@@ -300,6 +305,7 @@ def as_problem(problem: object) -> Problem:
     """Return a problem from a problem, its record, or the name or the file of a problem, a pipeline or a dataset."""
     if isinstance(problem, Problem):
         return problem
+    # A record is rebuilt once for all its callers.
     if isinstance(problem, StoredProblem):
         return _rebuilt(as_record(problem))
     if isinstance(problem, str | Path):
@@ -347,6 +353,8 @@ def _opened(record: ProblemRecord) -> tuple[Problem, Robot]:
     from cnpgen.problems.load_robot import load_robot
 
     with record.restored() as problem:
+        # Scenes differ in their obstacles only: the robot, which is slow to load, is
+        # shared.
         if problem.obstacle:
             # Errors are reported below, with the whole problem.
             with suppress(RecipeError):
@@ -378,10 +386,12 @@ def _comparable(record: ProblemRecord) -> dict[str, Any]:
         for key, value in kept["robot"].items()
         if key not in {*FILES, "base"}
     }
+    # A difference of the URDF is one key, not the text.
     robot["urdf"] = hashlib.sha256(record.urdf.encode()).hexdigest()
     constraints: dict[str, Any] = {}
     counts = Counter[str]()
     for kind in kept["constraint"]:
+        # Constraints of one kind are numbered in the order of the file.
         counts[kind["use"]] += 1
         name = (
             f"{kind['use']} {counts[kind['use']]}"

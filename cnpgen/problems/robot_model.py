@@ -131,6 +131,8 @@ class RobotModel:
         self._kernels: KernelLibrary = problem_kernels(
             self.problem, robot, *choose_backend(backend)
         )
+        # Kernels and the world of Coal are built on first use: a caller of limits needs
+        # neither.
         self._loaded: dict[str, Kernel] = {}
         self._world: World | None = None
 
@@ -148,6 +150,7 @@ class RobotModel:
             Positions [m], shape (N, 3), and rotation matrices, shape (N, 3, 3).
         """
         position, rotation, _ = self._run("tip_pose", self._states("q", q))
+        # Kernels return arrays with the states last, and matrices row by row.
         return position.T.copy(), rotation.T.reshape(-1, 3, 3)
 
     @checked_arguments
@@ -268,6 +271,8 @@ class RobotModel:
         g, *jacobians, drift = self._run("constraint_values_of", *states, lanes)
         names, lower, upper, tolerance = self._conditions()
         shape = (len(self.joint_names), len(names))
+        # The kernel stacks a Jacobian column by column, (n m, N): as (N, n, m), then
+        # (N, m, n).
         by_q, by_dq, by_ddq = (
             part.T.reshape(-1, *shape).swapaxes(1, 2) for part in jacobians
         )
@@ -322,6 +327,7 @@ class RobotModel:
         problem, robot = self.problem, self._robot
         if self._world is None:
             self._world = World(robot, problem.obstacle, problem.object_size)
+        # Distances depend on positions only.
         world, rest = self._world, np.zeros(robot.n)
         world.set_state(q, rest, rest, poses)
         distances: list[float] = []
@@ -331,6 +337,8 @@ class RobotModel:
                 *(world.shape_distances() if problem.obstacle else ()),
             ]
         elif problem.obstacle:
+            # Capsules of the paper: the distance of axes less the radius of the
+            # thickest.
             radii = [
                 float(getattr(item, "radius", 0.0) or 0.0)
                 for item in problem.constraint
@@ -349,6 +357,8 @@ class RobotModel:
             from cnpgen.problems.obstacles import scene_of
 
             scene = scene_of(self.problem, *np.zeros((3, 1, 3)))
+            # Start, goal and goal velocity are zero: only obstacles that follow them
+            # depend on this.
             return np.repeat(scene.lanes, n, axis=1)
         if len(scene) not in {1, n}:
             raise UsageError(
@@ -411,6 +421,7 @@ def tip_pose(robot: Robot) -> Any:
 
     q_sx, q = symbols("q", robot.n)
     kin = forward_kinematics(robot.chain, q)
+    # A prismatic joint does not turn the tip.
     angular = [
         axis if turns else [0.0, 0.0, 0.0]
         for axis, turns in zip(kin.axes, kin.revolute, strict=True)
@@ -474,15 +485,19 @@ def constraint_values_of(robot: Robot, problem: Problem) -> Any:
     ]
     g = ca.vertcat(*(value for _, condition in pairs for value in condition.g))
     jacobians = [ca.vec(ca.densify(ca.jacobian(g, x))) for x in inputs[:3]]
+    # Only conditions of positions have a drift: those that use dq or ddq are multiplied
+    # by zero.
     still = [
         symbolic_needs(condition, *inputs[1:3]) == 0
         for _, condition in pairs
         for _ in condition.g
     ]
     positions = g * ca.DM([float(flag) for flag in still])
+    # Second derivative of g along dq, which is (dJ_q / dt) dq with ddq = 0.
     drift = ca.densify(
         ca.jtimes(ca.jtimes(positions, inputs[0], inputs[1]), inputs[0], inputs[1])
     )
+    # Frozen closest points become expressions again only after differentiation.
     outputs = ca.cse(state.unfrozen([ca.densify(g), *jacobians, drift]))
     return ca.Function("constraint_values_of", inputs, outputs)
 
@@ -498,6 +513,7 @@ def _symbolic_conditions(
     pairs = [
         (constraint, condition)
         for constraint in problem.constraint
+        # The state has no jerk.
         if not constraint.uses_jerk
         for condition in constraint.symbolic(state)
     ]

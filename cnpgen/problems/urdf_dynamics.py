@@ -32,6 +32,7 @@ class JointFriction:
         """Fraction of the effort that friction takes at the velocity limit; infinite without an effort."""
         effort = self.joint.limits.get("effort", 0.0)
         speed = self.joint.limits.get("velocity", 0.0)
+        # b v_max + c: the friction at the velocity limit, in the unit of the effort.
         friction = self.joint.damping * speed + self.joint.friction
         return friction / effort if effort else math.inf
 
@@ -50,6 +51,7 @@ def friction_in(joints: Sequence[UrdfJoint]) -> list[JointFriction]:
 def suggested_use(frictions: Sequence[JointFriction], joints: int) -> str:
     """Return "use", or "ignore" for values that look like placeholders: large shares, or one pair for all joints."""
     pairs = {(each.joint.damping, each.joint.friction) for each in frictions}
+    # Real joints differ: one pair of values for all of several joints was not measured.
     placeholders = len(frictions) == joints > 1 and len(pairs) == 1
     large = any(each.share >= MAX_PLAUSIBLE_SHARE for each in frictions)
     return "ignore" if placeholders or large else "use"
@@ -80,6 +82,7 @@ def joint_notes(
     for rate in ("acceleration", "jerk"):
         if given := [each.name for each in joints if rate in each.rates]:
             yield f"the URDF limits the {rate} of {', '.join(given)}; [limits] replaces it"
+    # A reflected inertia J = ratio^2 * J_rotor needs both factors.
     reduced = {
         joint.get("name", "")
         for transmission in tree.findall("transmission")

@@ -57,6 +57,8 @@ def _all_attempts(
         )
         yield refiner.measured(task, guess, outcome, unlimited=True)
         return
+    # A plan with more control points than the problem's is refined with the problem's
+    # first, which is faster.
     if x is not None and refiner.coarser is not None:
         yield from _with_fewer_control_points(refiner, refiner.coarser, task, x)
     adjusted = (
@@ -118,6 +120,7 @@ def _with_fewer_control_points(
     With three times as many control points a step takes ten times as long, for
     objectives that are 0.3 % lower.
     """
+    # The ends may fix more control points than the problem's splines have.
     if coarser.spec.path_control_points < task.boundary.min_control_points(
         coarser.spec.degree
     ):
@@ -136,6 +139,7 @@ def _with_fewer_control_points(
     )
     for attempt in () if guess is None else run_levels(coarser, task, guess, None):
         motion = Motion(attempt.path[None], attempt.rate[None], degree)
+        # Knot insertion does not change the curve.
         finer = with_finer_knots(motion, refiner.spec)
         variables = own.pack(finer.path[0], finer.rate[0])
         path, rate = own.unpack(variables)
@@ -167,6 +171,8 @@ def run_levels(
     outcome = Outcome.SOLVED if coarse.converged else Outcome.NOT_CONVERGED
     feasible = coarse.violation <= refiner.settings.violation_tolerance
     if feasible:
+        # The solver minimizes the objective plus the smoothing of log r; attempts are
+        # compared by the objective alone.
         cost = coarse.cost - refiner.check.transcription(task).regularization(coarse.x)
         # most of these are valid, so that their violation is not needed
         yield refiner.attempt(
@@ -178,6 +184,7 @@ def run_levels(
     best = refiner.continue_scaled(task, best)
     if not feasible or best.x is not coarse.x:
         yield best
+    # The fine levels would start far from any valid motion.
     if best.violation > max_violation:
         return best
     fine = refiner.solve(task, refiner.levels.fine, best.variables, Outcome.SOLVED_FINE)
@@ -220,6 +227,8 @@ def _from_other_guesses(
         other = refiner.solve(task, refiner.levels.restart, guess, Outcome.RESTARTED)
         yield other
         best = other if other.is_better(best) else best
+    # Uniform scaling comes first: the solver then starts from a motion that meets the
+    # limits that scaling can meet.
     last = refiner.time_scaled(task, best, unlimited=True) if task.at_rest else best
     yield refiner.solve(task, refiner.levels.warm, last.variables, Outcome.RESTARTED)
     if task.at_rest:
@@ -265,6 +274,7 @@ def along_tree_paths(
     for guess in path_guesses(refiner, task):
         found_path, attempt = True, along_path(refiner, task, guess)
         yield attempt
+        # Such attempts fail by little: the strict level may close the rest.
         if attempt.violation <= MAX_JUDGED_VIOLATION:
             yield refiner.solve(
                 task, refiner.levels.strict, attempt.variables, Outcome.RESTARTED
@@ -284,6 +294,8 @@ def around_obstacles(
     best_first = (
         refiner.hulls.violation(positions, task.scene.poses[0]) < MAX_PENETRATION_M
     )
+    # A plan that is only slightly in collision is nearer to a valid one than a new
+    # path.
     if best_first:
         yield from _on_hulls(refiner, task, best)
     for guess in path_guesses(refiner, task):
@@ -334,6 +346,7 @@ def path_guesses(refiner: Refiner, task: RefinementTask) -> Iterator[Attempt]:
 def along_path(refiner: Refiner, task: RefinementTask, guess: Attempt) -> Attempt:
     """Optimize a motion along a joint-space path: with a high penalty of violations first, then as usual."""
     best = refiner.solve(task, refiner.levels.path, guess.variables, Outcome.RESTARTED)
+    # A second run on the level on which the first one ended changes nothing.
     same_level = (
         refiner.levels.path is refiner.levels.warm
         and best.outcome is not Outcome.TIME_SCALED

@@ -103,20 +103,26 @@ class FineCheck:
             if self._penetration is None
             else self._penetration(task, motion.positions(x))
         )
+        # The excess is above the tolerance: even the smallest counts as above 1.
         collision = 1.0 + excess / PENETRATION_SCALE_M if excess > 0 else 0.0
         if max(worst, collision) <= 1:
             return cost, GridViolation(worst, False, 1.0)
         violated = ratio > 1
         with np.errstate(divide="ignore", invalid="ignore"):
+            # Ratio of a residual to the bound that it violates.
             size = np.where(
                 violated,
                 g / np.where(g > bounds.upper, bounds.upper, bounds.lower),
                 0.0,
             ).max(axis=0)
+            # A residual that grows with the power p of the rate needs the p-th root of
+            # its ratio.
             size[self._speeds] **= 1 / self._powers
         speed, strength, jerk = (
             size[self._bounds.orders == order].max(initial=1.0) for order in (1, 2, 3)
         )
+        # Scaling time by k divides velocities by k, accelerations and torques by k^2,
+        # jerks by k^3.
         time_scale = max(speed, float(np.sqrt(strength)), float(np.cbrt(jerk)))
         position = collision > 1 or bool(violated[:, self._bounds.orders == 0].any())
         return cost, GridViolation(max(worst, collision), position, time_scale)
@@ -204,6 +210,7 @@ class FineCheck:
                 break
             total *= violation.time_scale * (1 + 1e-9)
             x = x.copy()
+            # The variables are log r: dividing the rate is a subtraction.
             x[split:] -= np.log(violation.time_scale * (1 + 1e-9))
             cost, violation = self.measure(task, x)
         return x, cost, violation
@@ -213,6 +220,7 @@ def _powers_of_rate(problem: Problem, world: World, kernels: ResidualKernels) ->
     """Return the power of the rate with which every residual of velocities grows, at least 1, shape (m,)."""
     n, orders, random = world.robot.n, problem.path_orders, np.random.default_rng(0)
     w = np.zeros((orders * n + orders - 1, 2))
+    # Random p and p' at the rates 1 and 2: the ratio of the residuals is 2^power.
     w[: 2 * n] = random.uniform(0.1, 1.0, (2 * n, 1))
     w[orders * n] = 1.0, 2.0
     scene = np.zeros((problem.scene_width, 2))

@@ -50,6 +50,7 @@ def refine_task_within(
     if first is not None and is_over(valid=True):
         return first.result(first.iterations)
     best = refine_task(refiner, checker, task, is_over)
+    # The first plan is kept where the complete search finds none that is better.
     if first is None or (best.valid and best.cost <= first.cost):
         return best
     return first.result(best.iterations)
@@ -105,6 +106,7 @@ def fast_rate(
     count, degree = spec.rate_control_points, spec.degree
     s = np.linspace(0, 1, SAMPLES_PER_CONTROL_POINT * spec.path_control_points)
     slope, curvature = (basis(s, len(path), degree, order) @ path for order in (1, 2))
+    # |p' r| <= v and |p'' r^2| <= a give r <= v / |p'| and r <= sqrt(a / |p''|).
     largest = np.minimum(
         (velocity / np.abs(slope)).min(axis=1),
         np.sqrt((acceleration / np.abs(curvature)).min(axis=1)),
@@ -117,10 +119,12 @@ def fast_rate(
             for low, high in zip(knots[:count], knots[degree + 1 :], strict=True)
         ]
     )
+    # Large ratios of control points make r', and with it p' r r', large.
     control = np.minimum(control, MAX_RATE_RATIO * control.min())
     rate, change = (basis(s, count, degree, order) @ control for order in (0, 1))
     speed, bend = slope * rate[:, None], curvature * rate[:, None] ** 2
     strength = np.abs(bend + slope * (rate * change)[:, None]) / acceleration
     # r / f has f times smaller velocities and f^2 times smaller accelerations.
+    # The largest excess of both kinds, so that all limits hold at the samples.
     factor = max((np.abs(speed) / velocity).max(), np.sqrt(strength.max()))
     return np.asarray(control / factor)

@@ -53,6 +53,8 @@ def refine_goal_options(
     chosen, lowest, files = dict[int, int](), dict[int, float](), list[Path]()
     if begin is not None:
         begin(len(tasks), 0)
+    # With a time limit the first valid goal ends the search of its task: no duration is
+    # below infinity.
     bounds = np.full(len(plans), np.inf) if first_valid else min_durations(plans)
     for round_number, rows in enumerate(_rounds(plans, bounds, lowest)):
         file = (
@@ -74,6 +76,7 @@ def refine_goal_options(
                 progress(int(first), int(improves and task not in lowest))
             if first or improves:
                 chosen[task] = len(results)
+            # The lowest cost decides which goals are still tried in the next rounds.
             if improves:
                 lowest[task] = result.cost
             results.append(result)

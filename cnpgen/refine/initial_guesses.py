@@ -69,6 +69,7 @@ def line_through(
         # The boundary conditions fix all control points.
         return interior, rate
     along = np.linspace(0, 1, len(interior))[:, None]
+    # 0 at both ends and 1 in the middle.
     parabola = 4 * along * (1 - along)
     center = (interior[0] + interior[-1]) / 2
     return interior + 0.5 * parabola * (configuration - center), rate
@@ -82,9 +83,12 @@ def quintic(
     duration = 1.0 / rate[0]
     s = np.linspace(0, 1, 4 * spec.path_control_points)
     q0, q1 = boundary.start_q[0], boundary.goal_q[0]
+    # Derivatives by the phase s = t / T: dq T and ddq T^2.
     v0, v1 = boundary.start_dq[0] * duration, boundary.goal_dq[0] * duration
     a0 = boundary.start_ddq[0] * duration**2
+    # Rows: value, first and second derivative of c3 s^3 + c4 s^4 + c5 s^5 at s = 1.
     constraint = np.array([[1, 1, 1], [3, 4, 5], [6, 12, 20]], float)
+    # The goal acceleration is zero.
     right = np.stack([q1 - q0 - v0 - a0 / 2, v1 - v0 - a0, -a0])
     cubic = np.linalg.solve(constraint, right)
     powers = s[:, None] ** np.arange(6)
@@ -112,6 +116,8 @@ def fit_to_path(
     s = np.linspace(0, 1, SAMPLES_PER_CONTROL_POINT * spec.path_control_points)
     q = _states_along(states, s)
     count, n = spec.path_control_points - 3 - boundary.fixed_at_goal, states.shape[1]
+    # The control points of the ends are known: the least squares fit has only the
+    # interior ones.
     fixed = assemble(boundary, np.zeros((1, count, n)), rate[None], spec)[0]
     table = basis(s, spec.path_control_points, spec.degree)
     inner = slice(3, 3 + count)
@@ -135,10 +141,13 @@ def _states_along(states: Array, s: Array) -> Array:
     length = max(float(lengths[-1]), np.finfo(float).tiny)
     edges = np.diff(states, axis=0)
     directions = edges / np.maximum(np.diff(lengths), np.finfo(float).tiny)[:, None]
+    # Change of the unit direction at each corner, from 0 for none to 2 for a reversal.
     turns = np.linalg.norm(np.diff(directions, axis=0), axis=1)
     distances = (grid[:, None] - lengths[1:-1] / length) / CORNER_WIDTH
+    # More phase, hence a lower speed, around corners.
     weight = 1 + np.exp(-(distances**2)) @ turns
     ramp = np.minimum(np.minimum(grid, 1 - grid) / RAMP_PHASE, 1)
+    # Smoothstep: its slope is zero at both ends of the ramp.
     speed = ramp**2 * (3 - 2 * ramp)
     weights, distance = _integral(weight), _integral(speed)
     along = np.interp(np.interp(s, grid, distance), weights, grid)
@@ -167,6 +176,8 @@ def along_tip_path(
         [np.interp(along * lengths[-1], lengths, values) for values in tip_path.T],
         axis=1,
     )
+    # The straight line selects one of the arm's redundant configurations for each tip
+    # position.
     states = start_q + along[:, None] * (goal_q - start_q)
     obstacle_poses = place_obstacles(world.obstacles)
     for k in range(1, TIP_PATH_STATES - 1):

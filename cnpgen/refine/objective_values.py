@@ -54,9 +54,11 @@ def objective_values(plans: Plans, objective: str = "time") -> dict[str, Array]:
     )
     states = [grid.cost_bases.states(path, rate) for path, rate in control_points]
     e, _ = residuals(np.concatenate(states, axis=1))
+    # Rows of w: p and three derivatives, n rows each, then r.
     rates = np.array([w[4 * robot.n] for w in states])
     first = 0
     for count, term in zip(counts, cost_term.terms, strict=True):
+        # The integral over time is that over the phase, ds / r.
         size, _ = CostTerm((replace(term, weight=1.0),)).rate(
             e[first : first + count], [count]
         )

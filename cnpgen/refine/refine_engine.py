@@ -57,6 +57,7 @@ def prepare(plans: Plans, options: RefineOptions) -> Refiner:
     return _refiner(
         plans.problem,
         plans.motion.spec,
+        # These options belong to tasks: refiners that differ in them only are shared.
         replace(options, deadline=None, stay_within=None, time_limit=None),
     )
 

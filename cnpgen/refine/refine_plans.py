@@ -201,8 +201,10 @@ def _run(
             pool.distribute(partial(_refine, options=options), tasks, hint=hint)
         ) as results:
             for part, attempts, seconds in results:
+                # CPU time of all workers, shared among them.
                 watch.computing += seconds / count
                 if journal is not None:
+                    # Recorded before use: a crash afterwards does not lose it.
                     journal.append(part, attempts)
                 yield dict(zip(part, attempts, strict=True))
 
@@ -267,6 +269,7 @@ def identity_of_run(plans: Plans, options: RefineOptions) -> str:
         plans.path_control_points,
         plans.rate_control_points,
     ):
+        # Shapes are part of the digest: equal bytes of other shapes are other plans.
         digest.update(
             str(values.shape).encode() + np.ascontiguousarray(values).tobytes()
         )

@@ -76,6 +76,7 @@ def open_journal(path: Path, identity: str, *, discard: bool = False) -> Journal
 def _resume(path: Path, file: JournalFile, identity: str, *, discard: bool) -> Journal:
     """Read the finished plans; start a new run if there are none of this identity."""
     journal = Journal(path, {}, file)
+    # The first record is the identity of the run.
     for record in file.records[1:]:
         try:
             journal.finished |= _unpack(record)

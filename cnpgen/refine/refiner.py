@@ -104,6 +104,8 @@ class Refiner:
         if self.measures_hulls or has_clearance_constraints(problem, robot):
             self._library = load_collision_library(kernels)
         if self.measures_hulls:
+            # Distances become rows of the compiled hulls: the symbolic kernels do not
+            # contain them.
             solved = without_distances(problem)
             kernels = problem_kernels(
                 solved, robot, kernels.backend, kernels.cache_folder
@@ -196,6 +198,7 @@ class Refiner:
         settings = level.settings if extra is None else self.levels.strict.settings
         ends = motion.end_residuals()
         bounds = self.bounds(task, level, ends)
+        # No step can change the boundary states; the solver only evaluates the motion.
         if not np.nanmax(bounds.end_violations(ends)) < MAX_END_VIOLATION:
             settings = replace(settings, max_iterations=0)
         hulls = self.hulls if self.measures_hulls else hulls
@@ -203,6 +206,8 @@ class Refiner:
             motion = HullTranscription(motion, hulls, task.scene.poses[0])
             more: Array | float = 0.0 if extra is None else extra
             if self.measures_hulls:
+                # Near an end the hulls may be as close as the end itself, within the
+                # tolerance.
                 more = more - accepted_along(
                     near_ends(motion.grid.s), self.accepted_at_ends(task)
                 )
@@ -263,6 +268,8 @@ class Refiner:
             if best.outcome is not Outcome.TIME_SCALED:
                 break
             again = self.solve(task, self.levels.warm, best.variables, Outcome.SOLVED)
+            # Uniform scaling slows the motion everywhere; another run regains the time
+            # where limits have room.
             if not (again.violation <= 1 and again.cost < best.cost):
                 break
             best = replace(again, iterations=best.iterations + again.iterations)
@@ -288,6 +295,8 @@ class Refiner:
         more = self._feedback(level).clearance_at(
             path, self.hulls, task.scene.poses[0], phase=phase, depth=depth
         )
+        # Distances add up over the feedbacks, so that a collision that persists is
+        # pushed further.
         extra = more if extra is None else extra + more
         result = self.run_level(task, level, attempt.variables, extra=extra)
         result = self._separated(task, level, result, extra)
@@ -344,6 +353,7 @@ class Refiner:
         attempt = self.attempt(
             task, x, cost, outcome, iterations=iterations, violation=violation.worst
         )
+        # Scaling in time keeps boundary velocities and accelerations only at rest.
         scalable = attempt.violation > 1 and task.at_rest
         return (
             self.time_scaled(task, attempt, unlimited=unlimited)
@@ -457,6 +467,8 @@ class Refiner:
         """
         interior, rate = guess
         x = np.concatenate([interior.ravel(), np.log(rate)])
+        # Speeds such as that of the tip are not bounded by those of the joints, from
+        # which guesses take their rates.
         factor = self.check.speed_ratio(task, x)
         return (
             x

@@ -108,11 +108,14 @@ class RestSpace:
         met, poses = self._met(q), self.scene_poses
         if self.hulls is None:
             return _first(~np.logical_and.reduce(met))
+        # Cheap conditions first: each one only checks the states before the first
+        # invalid one.
         first = _first(~np.logical_and.reduce(met[~self.capsules]))
         if first:
             first = _first(
                 ~self.hulls.clear_states(q[:, :first], poses, links_only=True)
             )
+        # Capsules contain their links: where they are clear, the hulls need no check.
         resolved = np.logical_and.reduce(met[self.capsules]) & self.capsules.any()
         unresolved = np.flatnonzero(~resolved[:first])
         if not len(unresolved):
@@ -133,6 +136,8 @@ class RestSpace:
         lower, upper = self.lower[rows, None], self.upper[rows, None]
         for _ in range(MAX_PROJECTIONS):
             g, columns = self.kernels.jacobian(*self._arguments(q))
+            # Bounds of equalities are relaxed by their tolerances; the middle is the
+            # equality itself.
             error = g[rows] - (lower + upper) / 2
             if (np.abs(error) <= PROJECTED_FRACTION * (upper - lower) / 2).all():
                 break
@@ -140,6 +145,8 @@ class RestSpace:
                 columns.reshape(-1, len(rows), q.shape[1])[: len(q), rows]
                 * ((q > low) & (q < high))[:, None]
             )
+            # Damped Gauss-Newton: dq = -J^T (J J^T + damping)^-1 error, for all states
+            # at once.
             square = np.einsum("iak,ibk->kab", J, J)
             damping = (
                 RELATIVE_DAMPING
@@ -183,6 +190,7 @@ class _Tree:
         nearest = int(np.argmin(np.square(np.array(self.nodes) - target).sum(axis=1)))
         begin = self.nodes[nearest]
         distance = float(np.linalg.norm(target - begin))
+        # Long extensions are cut to the largest length.
         end = (
             target
             if distance <= max_extension
@@ -215,6 +223,7 @@ def follow_line(begin: Array, end: Array, follow: Follow) -> tuple[Array, bool]:
     for first in range(0, count, STATES_PER_CHECK):
         block = fractions[first : first + STATES_PER_CHECK]
         valid = follow(begin[:, None] + (end - begin)[:, None] * block)
+        # Projection may tear neighbors apart: a gap ends the edge.
         spacing = np.abs(np.diff(np.hstack([states[:, -1:], valid]))).max(
             axis=0, initial=0.0
         )
@@ -251,12 +260,14 @@ def find_path(
     The arguments are those of ``find_paths``, and the seed of the random numbers.
     """
     random, trees = np.random.default_rng(seed), (_Tree(start), _Tree(goal))
+    # Joints with wide ranges are sampled near both ends only.
     lower = np.maximum(robot.position_lower, np.minimum(start, goal) - MAX_TURN)
     upper = np.minimum(robot.position_upper, np.maximum(start, goal) + MAX_TURN)
     for extension in range(MAX_EXTENSIONS):
         tree, other = trees[extension % 2], trees[1 - extension % 2]
         before = len(tree.nodes)
         tree.grow(random.uniform(lower, upper), follow, MAX_EXTENSION)
+        # Connect: the other tree grows as far as the new node.
         if len(tree.nodes) > before and other.grow(tree.nodes[-1], follow, np.inf):
             return _shortened(
                 np.vstack([trees[0].path(), trees[1].path()[::-1]]), follow, random
@@ -267,6 +278,8 @@ def find_path(
 def _shortened(path: Array, follow: Follow, random: np.random.Generator) -> Array:
     """Replace sections of a path by valid straight lines with fewer states."""
     for _ in range(SHORTCUTS):
+        # Random pairs of states: a valid line between them replaces the section if it
+        # has fewer states.
         first, last = np.sort(random.integers(len(path), size=2))
         states, reached = follow_line(path[first], path[last], follow)
         if reached and len(states) < last - first:
@@ -302,11 +315,13 @@ class TreeSearch:
             yield line
             return
         found += self._small_trees(seeds)
+        # Large trees only if small ones find too few paths.
         missing = max(MIN_TREE_PATHS - len(found), 0)
         found += islice(
             self._large_trees(seeds, TREE_EXTENSION_RAD, bool(found)), missing
         )
         space, limit = self.space, self.space.robot.velocity_limit
+        # Paths that meet all other conditions come first, then the fastest.
         durations = [
             (not space.meets_other_conditions(path), estimated_duration(path, limit))
             for path in found

@@ -87,6 +87,8 @@ def refine_task(
     for plan in (
         () if search.costs_less_than_input(best, x) else _input_plans(refiner, task, x)
     ):
+        # The input plan is judged only if it may be better: without a valid plan, or at
+        # most as expensive and not refuted.
         if not best.valid or (
             plan.cost <= best.cost and not checker.refutes(task, plan.path, plan.rate)
         ):
@@ -113,6 +115,7 @@ def refine_task_until(
     if not task.is_finite:
         return _invalid_input(refiner, task)
     search, x = RefinementSearch(refiner, checker, task), refiner.input_variables(task)
+    # The last verdict must fit before the deadline, so that its time is reserved.
     verdicts = Deadline(until, max_duration=VERDICT_TIME_S)
     best: Attempt | None = None
     for plan in _input_plans(refiner, task, x):
@@ -127,6 +130,7 @@ def refine_task_until(
     )
     cut = late = best is not None and not verdicts.allows(1)
     while not late and (attempt := next(attempts, None)) is not None:
+        # The solver ended at its deadline.
         cut |= attempt.outcome is Outcome.NOT_CONVERGED
         if best is None or verdicts.allows(1):
             ends = search.add(attempt) or search.ends_are_invalid()
@@ -270,6 +274,8 @@ class RefinementSearch:
         self.iterations += attempt.iterations
         self.found_no_path |= attempt.outcome is Outcome.NO_PATH
         valid = sum(earlier.valid for earlier in self.judged)
+        # A valid plan without contacts ends the search at the next attempt; plans with
+        # contacts only after several.
         found_valid = valid >= MAX_CONTACTS or valid > self.contacts
         if attempt.violation > MAX_JUDGED_VIOLATION:
             self.skipped.append(attempt)
@@ -315,8 +321,11 @@ class RefinementSearch:
                 or attempt.violation > MAX_JUDGED_VIOLATION
             ):
                 break
+            # Deep collisions need another path, not a larger distance.
             if not 0 < margin.violation < MAX_FED_BACK_M:
                 break
+            # Each further feedback of one attempt demands more, until the edge is
+            # resolved by the grid.
             depth = margin.violation * FEEDBACK_GROWTH**earlier
             following = self.refiner.fed_back(
                 self.task, attempt, margin.phase, depth, extra
@@ -360,6 +369,8 @@ class RefinementSearch:
         judge = self.checker.strict_verdict if removable else self.checker.verdict
         verdict = self.verdict = judge(self.task, plan.path, plan.rate)
         touches = not verdict.valid and verdict.reason in LINK_REASONS
+        # Invalid only without the tolerance of contacts: the usual verdict decides on
+        # validity.
         if touches and removable:
             verdict = self.checker.verdict(self.task, plan.path, plan.rate)
         keeps_outcome = verdict.valid or plan.outcome in INPUT_OUTCOMES

@@ -103,7 +103,9 @@ def with_padded_link(
     robot = urdf_tree(urdf)
     links = {each.get("name", ""): each for each in robot.findall("link")}
     copy = Element("link", name=attached_link_name(f"padding of {link}"))
+    # The enlarged shapes are copies, since the link keeps its own ones.
     copy.extend(deepcopy(links[link].findall("collision")))
+    # A link without collision geometry has nothing to enlarge.
     if not len(copy):
         return urdf
     for shape in copy.iterfind("collision/geometry/*"):
@@ -146,6 +148,7 @@ def uniform_inertia(shapes: Sequence[Obstacle], mass: float) -> pin.Inertia:
         inertia = density * np.array(body.computeMomentofInertiaRelatedToCOM())
         center = np.array(body.computeCOM())
         placement = pin.SE3(turned(*shape.rotation), np.array(shape.position))
+        # Inertias add up in one frame: that of the poses.
         total += placement.act(pin.Inertia(density * volume, center, inertia))
     return total
 

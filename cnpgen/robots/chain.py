@@ -70,6 +70,8 @@ class Chain:
 
         Infinite with prismatic joints.
         """
+        # A prismatic joint lengthens the chain by its position, which is not bounded
+        # here.
         if any(joint.prismatic for joint in self.joints):
             return np.inf
         # Links can be stretched at most to the sum of their lengths.
@@ -91,6 +93,8 @@ def chain_from_model(model: "pin.Model", tip: str) -> Chain:
             raise RecipeError(
                 [f"robot.joints: {name!r} is {_kind(joint.shortname())}: {_PLANNED}"]
             )
+        # In one serial chain every joint moves the next one; the parent of joint 1 is
+        # the world, 0.
         if model.parents[index] != index - 1:
             before = model.names[index - 1]
             raise RecipeError(

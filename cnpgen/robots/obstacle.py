@@ -194,6 +194,7 @@ def invalid_obstacle(obstacles: Iterable[Obstacle]) -> str:
         for each in obstacles
         for error in each.value_errors()
     )
+    # Some errors begin with the name of the obstacle already.
     return next(
         (
             text if text.startswith(name) else f"{name}: {key} {text}"

@@ -137,6 +137,7 @@ class ParameterRanges:
         ``values`` are those of the problem.
         """
         factors = ("velocity_factor", "acceleration_factor", "payload_inertia")
+        # Summands are 0 and factors 1, unless the problem gives a value.
         nominal = (
             dict.fromkeys(self.names, 0.0) | dict.fromkeys(factors, 1.0) | dict(values)
         )
@@ -154,6 +155,7 @@ class ParameterRanges:
         """
         if not len(self):
             return values, {}
+        # The parameters are the last values.
         first = max(len(values) - len(self), 0)
         return values[:first], dict(
             zip(self.names, values[first:] if len(values) else nominal, strict=True)
@@ -175,6 +177,8 @@ class ParameterRanges:
                 argument="parameters",
             )
         rows = values.reshape(-1, len(self))
+        # Comparisons with nan are false, so that nan would pass; infinity is out of all
+        # ranges.
         if text := self.out_of_range(np.nan_to_num(rows, nan=np.inf), shown=rows):
             raise UsageError(text, argument="parameters")
         return rows
@@ -211,6 +215,7 @@ class ParameterRanges:
             finite = values[np.isfinite(values)].tolist()
             low, high = min(finite, default=span.low), max(finite, default=span.high)
             key = declared[name]
+            # A range is widened up to the bounds of its key only.
             least = -np.inf if key.low is None else key.low
             largest = np.inf if key.high is None else key.high
             if low < least or high > largest:

@@ -78,6 +78,8 @@ def check_plausible(
             joint = (
                 f" of {robot.joint_names[wrong.column]}" if name.endswith("q") else ""
             )
+            # The place of the value goes before the hint at a unit, which follows a
+            # semicolon.
             text, mark, hint = str(wrong).partition(";")
             raise UnitError(
                 f"{text} in {noun} {wrong.row}{joint}{mark}{hint}", argument=name
@@ -86,9 +88,11 @@ def check_plausible(
 
 def _plausible_range(robot: Robot, name: str, unit: str) -> tuple[Any, Any]:
     """Return the ends of the plausible range of a quantity, scalars or one per joint."""
+    # The quantity is the last part of a name: "start_q" -> "q".
     quantity = name.rpartition("_")[2]
     if quantity == "q":
         low, high = robot.position_lower, robot.position_upper
+        # A joint without limits has the center nan and an infinite half range.
         with np.errstate(invalid="ignore"):
             center, half = (low + high) / 2, MAX_RANGE_RATIO * (high - low) / 2
         bounded = np.isfinite(half)
@@ -98,6 +102,7 @@ def _plausible_range(robot: Robot, name: str, unit: str) -> tuple[Any, Any]:
     limits = {"dq": robot.velocity_limit, "ddq": robot.acceleration_limit}
     if quantity in limits:
         return -MAX_LIMIT_RATIO * limits[quantity], MAX_LIMIT_RATIO * limits[quantity]
+    # Velocities of the tip are bounded by the reach times the norm of joint velocities.
     speed = float(np.linalg.norm(robot.velocity_limit)) if unit == "m/s" else 1.0
     lengths = MAX_LIMIT_RATIO * robot.reach * speed
     bound = {"rad": MAX_ANGLE_RAD, "m": lengths, "m/s": lengths}.get(unit, np.inf)

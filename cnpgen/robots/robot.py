@@ -124,6 +124,7 @@ class Robot:
         drive = self.drive
         if drive is None or not drive.motor_rows:
             return self.torque_limit
+        # The limit of the joint counts too where both sides of the gear are limited.
         left = drive.resting_limit - drive.resting_friction
         return np.minimum(self.torque_limit, left) if drive.limits_joint else left
 
@@ -136,6 +137,7 @@ class Robot:
     def state_bounds(self) -> tuple[Array, Array]:
         """Lower and upper limits of positions, velocities and accelerations at both ends, shape (6 n,) each."""
         moving = self.velocity_limit, self.acceleration_limit
+        # Positions, velocities and accelerations at the start, then those at the goal.
         low = [self.position_lower, *(-limit for limit in moving)]
         return np.concatenate(2 * low), np.concatenate(
             2 * [self.position_upper, *moving]
@@ -228,6 +230,8 @@ def read_model(
             model = pin.buildModelFromXML(limited)
         except ValueError:
             with recipe_errors_in(urdf):
+                # The refusal may come from swapped limits of a joint that is not
+                # planned.
                 _check_order_of_limits(
                     parameters, [joint.name for joint in parameters.joints.values()]
                 )
@@ -251,6 +255,7 @@ def read_model(
     reduced = (
         pin.buildReducedModel(model, locked, pin.neutral(model)) if locked else model
     )
+    # The first name is that of the world, which is no joint of the URDF.
     if tuple(reduced.names)[1:] != tuple(joints):
         raise RecipeError(
             [
@@ -263,6 +268,7 @@ def read_model(
         check_model(reduced, parameters)
         if attached.uses_soft_limits:
             _narrow_to_soft_limits(reduced, planned, attached)
+    # Attachments come after the comparison with the URDF, which does not contain them.
     attach(reduced, attached)
     return reduced, planned
 
@@ -300,6 +306,7 @@ def _mimic_errors(tree: ElementTree.Element, planned: Sequence[str]) -> Iterator
             yield f"{name!r} mimics {other!r} and cannot be planned by itself; mimic joints are not supported"
         elif other in planned:
             yield f"{name!r} mimics the planned joint {other!r}, but would stay at zero; mimic joints are not supported"
+        # A joint that mimics one at zero stands at its offset.
         elif offset := _mimic_offset(mimic):
             yield f"{name!r} mimics {other!r} with {offset}, but would stay at zero; mimic joints are not supported"
 
@@ -353,6 +360,7 @@ def _capsule_axes(model: "pin.Model", tip: str) -> tuple[tuple[int, int], ...]:
         poses.append(np.array([*origins, data.oMf[frame_of(model, tip)].translation]))
     points = np.array(poses)  # (configurations, points, 3)
 
+    # A point that no joint moves has equal positions in all configurations.
     def still(a: int) -> bool:
         return bool(np.ptp(points[:, a], axis=0).max() < 1e-9)
 
@@ -360,16 +368,19 @@ def _capsule_axes(model: "pin.Model", tip: str) -> tuple[tuple[int, int], ...]:
         first, second = points[:, b] - points[:, a], points[:, c] - points[:, b]
         # A link that folds back is a separate segment.
         onwards = bool((first * second).sum(axis=1).min() > 0)
+        # Both parts lie on one line where their cross product vanishes.
         return onwards and bool(np.abs(np.cross(first, second)).max() < 1e-9)
 
     kept = [0]
     for point in range(1, points.shape[1]):
+        # Points that always coincide are one end of a segment.
         if np.abs(points[:, point] - points[:, kept[-1]]).max() < 1e-9:
             continue
         if len(kept) > 1 and straight(kept[-2], kept[-1], point):
             kept[-1] = point
         else:
             kept.append(point)
+    # A segment between two points that stand still belongs to the base.
     return tuple((a, b) for a, b in pairwise(kept) if not (still(a) and still(b)))
 
 
@@ -383,6 +394,7 @@ def attach(model: "pin.Model", attached: Attached) -> None:
         raise RecipeError([f"robot.tip: {text}; its frames: {listed(known)}"])
     index = frame_of(model, attached.frame)
     frame = model.frames[index]
+    # In the frame of the joint: pose of the frame, then the offset of the tip in it.
     placement = frame.placement * pin.SE3(attached.rotation, attached.translation)
     if attached.tip != attached.frame:
         model.addFrame(
@@ -417,5 +429,6 @@ def bounded(urdf: str, tree: ElementTree.Element, attached: Attached) -> str:
         limit = joint.find("limit")
         if limit is None:
             limit = ElementTree.SubElement(joint, "limit", velocity="0", effort="0")
+        # These limits only make the element complete; ``attach`` sets the given range.
         limit.attrib.update(lower="0", upper="0")
     return ElementTree.tostring(tree, encoding="unicode") if given else urdf

@@ -140,6 +140,7 @@ def _links_in_cycles(joints: Mapping[str, UrdfJoint]) -> list[str]:
             link = joints[link].parent
         if link in path:
             found.append(link)
+        # All links of the path lead to a root, or to a cycle that is listed.
         rooted |= path
     return found
 
@@ -214,6 +215,7 @@ def _joint(element: Element) -> UrdfJoint:
     }
     axis = np.array(numbers_in(element.find("axis"), "xyz", (1.0, 0.0, 0.0)))
     length = float(np.linalg.norm(axis))
+    # An axis of length 0, or of an infinite inverse length, cannot be normalized.
     if kind in _TURNING_OR_SLIDING and not math.isfinite(
         1 / length if length else math.inf
     ):
@@ -242,6 +244,7 @@ def _rates(limit: Element | None) -> dict[str, float]:
     for key, value in given.items():
         if value < 0:
             raise ValueError(f"{key}={value:g} must not be negative")
+    # The planned limit holds in both directions, so the smaller one counts.
     symmetric = [value for key in keys[:2] if (value := given[key])]
     rates = {"acceleration": min(symmetric, default=0.0), "jerk": given["jerk"]}
     return {key: value for key, value in rates.items() if value}
@@ -374,6 +377,8 @@ class _Comparison:
             if (inertia := self.parameters.inertias[link]) is not None
         ]
         expected = np.sum(values, axis=0) if values else np.zeros(10)
+        # Rounding errors grow with the terms of the sum, which may cancel in the sum
+        # itself.
         scale = np.abs(values).sum(axis=0) if values else np.zeros(10)
         actual = self.model.inertias[index]
         lever = np.asarray(actual.lever)
@@ -397,6 +402,7 @@ class _Comparison:
             if frame.type == pin.FrameType.BODY
         }
         for link, (joint, placement) in self.bodies.items():
+            # Links with the name of a joint have a suffix; see ``name_links_uniquely``.
             frame = frames.get(link + LINK_SUFFIX) or frames.get(link)
             if (
                 frame is None
@@ -418,11 +424,13 @@ def _parameters_about_origin(mass: float, com: Array, inertia: Array) -> Array:
     """Return mass, mass times center and inertia about the origin, which add up, shape (10,)."""
     # Overflow is a difference.
     with np.errstate(all="ignore"):
+        # Parallel axes: I_o = I_c + m (c.c E - c c^T), with the center of mass c.
         about_origin = inertia + mass * (com @ com * np.eye(3) - np.outer(com, com))
         return np.array([mass, *(mass * com), *about_origin[np.triu_indices(3)]])
 
 
 def _same_placement(actual: "pin.SE3", expected: LinkFrame) -> bool:
+    # Entries of a rotation are at most 1; translations below 1 mm count as 1 mm.
     return _same(actual.rotation, expected.rotation, scale=1.0) and _same(
         actual.translation,
         expected.translation,

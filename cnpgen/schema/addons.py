@@ -50,6 +50,7 @@ def lacking(addon: str) -> str:
     """
     if not addon:
         return ""
+    # The folder is looked for without importing it.
     if importlib.util.find_spec(f"{ADDONS}.{addon}") is None:
         return addon
     needed = getattr(importlib.import_module(f"{ADDONS}.{addon}"), "NEEDS", ())

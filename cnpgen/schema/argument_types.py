@@ -63,6 +63,7 @@ def checked_arguments(function: Callable[P, R]) -> Callable[P, R]:
     def prepared() -> tuple[tuple[str, ...], dict[str, Check], dict[str, Check]]:
         """Return the positional parameters, their checks before the call, and those after an error."""
         parameters = inspect.signature(function).parameters.values()
+        # Positional arguments are matched with their names, keywords have theirs.
         names = tuple(
             p.name
             for p in parameters
@@ -85,14 +86,19 @@ def checked_arguments(function: Callable[P, R]) -> Callable[P, R]:
     @functools.wraps(function)
     def call(*args: P.args, **keywords: P.kwargs) -> R:
         names, first, late = prepared()
+        # Only types that the function would accept and misuse are checked before the
+        # call, all others after an error.
         _run(first, names, args, keywords)
         try:
             return function(*args, **keywords)
+        # The function has reported the error itself.
         except CnpgenError:
             raise
         except MemoryError as error:
             text = f"out of memory in {function.__name__}: {error or 'pass fewer or smaller arrays'}"
             raise MachineError(text) from error
+        # An exception of Python may come from a wrong type: then the argument is named,
+        # otherwise it is raised again.
         except Exception:
             _run(late, names, args, keywords)
             raise
@@ -116,6 +122,7 @@ def _is_first(hint: Any) -> bool:
     """Return whether a wrong type must be found before the call."""
     present = alternatives(hint)
     if len(present) != 1:
+        # Masked arrays behave like arrays and would be used without their masks.
         return set(present) >= _ARRAYS
     (kind,) = present
     kind = get_origin(kind) or kind
@@ -187,6 +194,7 @@ def _check_of(hint: Any, *, strict: bool = False) -> Check | None:
                 return check(name, value)
             except UnexpectedValueError as error:
                 errors.append(error)
+        # One alternative: its own message is more exact than a list of one.
         if len(errors) == 1:
             raise errors[0]
         expected = either([error.expected for error in errors])

@@ -45,6 +45,7 @@ def integer(
     Accept NumPy integers, raise UsageError for bool and values out of range.
     """
     try:
+        # In Python a bool is an integer; operator.index refuses floats.
         found = None if isinstance(value, bool) else operator.index(value)
     except TypeError:
         found = None
@@ -105,6 +106,7 @@ def numbers(
     reject_masked(name, values)
     wrong = f"must be an array of numbers, got {type(values).__name__}"
     try:
+        # Tensors with gradients refuse the conversion to NumPy.
         detached = (
             values.detach()
             if hasattr(values, "detach") and not differentiable
@@ -141,6 +143,7 @@ def check_range(
 ) -> None:
     """Raise UsageError for values [unit] outside of their range or nan, with the unit that was probably meant."""
     array = np.asarray(values, np.float64)
+    # Negated, so that nan is outside.
     outside = ~((low <= array) & (array <= high))
     if outside.any():
         value = float(array[outside].flat[0])

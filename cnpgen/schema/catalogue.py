@@ -57,6 +57,7 @@ def find_file(
     shown = text if len(text) <= MAX_NAME_LENGTH else f"{text[:MAX_NAME_LENGTH]}..."
     known = {
         name: file
+        # Kinds that come first replace later ones of the same name.
         for kind in reversed(kinds)
         for name, file in list_recipes(kind).items()
     }
@@ -164,6 +165,7 @@ def read_kind(group: str, value: Any, where: RecipeLocation, errors: list[str]) 
         for hint in get_args(key.hint)
         if isinstance(hint, type)
     }
+    # Tables within the kind may be of registered kinds, too.
     readers: dict[type, Reader] = {
         hint: partial(read_kind, nested)
         for hint in hints

@@ -51,12 +51,14 @@ def entry_points() -> Mapping[str, tuple[EntryPoint, ...]]:
     groups: dict[str, list[EntryPoint]] = {}
     known: set[str] = set()
     for file in _metadata_files():
+        # The name of a distribution ends at the first hyphen: NAME-VERSION.dist-info.
         key = file.parent.name.partition("-")[0].lower()
         if key in known:
             # The first one on the path hides the others.
             continue
         known.add(key)
         text = file.read_text(encoding="utf-8")
+        # Most packages have no entry points of cnpgen.
         if f"[{PREFIX}" in text:
             for entry in _read(text, _distribution(file.parent)):
                 groups.setdefault(entry.group, []).append(entry)

@@ -156,6 +156,7 @@ class RecipeLocation:
 
     def __truediv__(self, key: str | int) -> "RecipeLocation":
         if isinstance(key, int):
+            # Entries of arrays are counted from 1 in messages.
             return RecipeLocation(self.file, f"{self.key} {key + 1}")
         bare = key if re.fullmatch(r"[\w-]{1,60}", key) else json.dumps(key[:60])
         return RecipeLocation(self.file, f"{self.key}.{bare}" if self.key else bare)
@@ -179,6 +180,8 @@ def to_dict(
         **{
             k.name: _plain(value, label)
             for k, value in values
+            # Keys that were added later are left out at their default, so that hashes
+            # of older recipes stay the same.
             if not (k.since_version > 1 and value == k.default)
         },
     }

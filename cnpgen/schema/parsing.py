@@ -61,6 +61,7 @@ def parse(
     before = len(errors)
     parser = _Parser(errors, readers or {})
     made: T | None = parser.attempt(lambda: parser.table(cls, table, where), where)
+    # Errors of nested tables count, too.
     return made if len(errors) == before else None
 
 
@@ -108,10 +109,12 @@ class _Parser:
             key.name: self.value(key.hint, table[key.name], key, where / key.name)
             for key in given
         }
+        # Checks of the whole table need all of its values.
         if len(self.errors) == before:
             made = cls(**values)
             self.check(errors_of(made), where)
             return made
+        # The checks of the valid part are reported with the other errors.
         self.check(_first_errors_of(_partly(cls, known, values)), where)
         return None
 
@@ -123,6 +126,7 @@ class _Parser:
 
     def read(self, hint: Any, value: Any, key: Key, where: RecipeLocation) -> Any:
         args = get_args(hint)
+        # Kinds and references have readers of their own, which take any value.
         if hint in self.readers:
             return self.readers[hint](value, where, self.errors)
         if hint in _LEAVES:
@@ -149,6 +153,7 @@ class _Parser:
         self, hint: Any, count: int | None, values: Any, key: Key, where: RecipeLocation
     ) -> tuple[Any, ...]:
         _check_filled(list, values, key)
+        # [0.1, 0.2] may mean one range or two points.
         if hint is Range and any(isinstance(item, int | float) for item in values):
             raise ValueError(
                 f"expected a list of ranges, got {show(values)}; write a point as [0.1, 0.1]"
@@ -279,6 +284,7 @@ def _bounded(number: _Number, key: Key, value: Any) -> _Number:
             f"{number}{unit} is too small, expected at least {key.low:g}{unit}"
         )
     if key.high is not None and number > key.high:
+        # A stated unit was meant.
         hint = (
             "" if _has_unit(value) else suggested_unit(number, key.unit, high=key.high)
         )

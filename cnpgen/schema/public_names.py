@@ -38,6 +38,7 @@ def lazy_exports(
             raise AttributeError(f"module {package!r} has no attribute {name!r}")
         else:
             value = _load_of_addon(package, name)
+        # The next access finds the name in the module.
         setattr(sys.modules[package], name, value)
         return value
 

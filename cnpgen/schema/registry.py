@@ -133,6 +133,7 @@ def load(group: str, name: str, base: type[Any] | None = None) -> type[Any]:
     noun = noun_of(group)
     sources = _sources(group, name)
     if not sources:
+        # A missing add-on raises an error that names it.
         if entry := addons.find(group, name):
             addons.load_entry(entry, f"{noun} {name!r}")
         known = f"known: {', '.join(names(group))}, and those of packages with the entry point group {group!r}"
@@ -188,6 +189,7 @@ def noun_of(group: str) -> str:
 
 def group_of(kind: type) -> str:
     """Return the group of a class; empty for other classes."""
+    # Names, not classes: the contracts need not be imported.
     bases = {f"{base.__module__}:{base.__qualname__}" for base in kind.__mro__}
     return next((group for group, name in CONTRACTS.items() if name in bases), "")
 
@@ -267,6 +269,7 @@ def package_in(error: BaseException) -> str:
     return next(
         (
             packages[top]
+            # From the innermost frame outwards.
             for top in (name.partition(".")[0] for name in modules[::-1])
             if top in packages
         ),

@@ -25,6 +25,7 @@ def read_own(path: Path, owner: Path, what: str) -> bytes:
 
     Links to other folders raise ValueError, since they could leak private files.
     """
+    # The folder of the owner, and that of the file that it links to.
     folders = Path(os.path.realpath(owner)).parent, Path(os.path.realpath(owner.parent))
     if Path(os.path.realpath(path)).parent not in folders:
         raise ValueError(

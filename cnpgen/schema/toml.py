@@ -81,6 +81,7 @@ def _read(path: Path) -> dict[str, Any]:
         found = re.search(
             r" \(at line (\d+), column \d+\)| \(at end of document\)", str(error)
         )
+        # An error at the end of the document is one of its last line.
         line = int(found[1]) if found and found[1] else len(data.splitlines())
         text = str(error).replace(found[0], "") if found else str(error)
         text += " (entries are separated by commas)" if text == "Unclosed array" else ""

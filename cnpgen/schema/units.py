@@ -102,6 +102,7 @@ def suggested_unit(
     outside of ``low`` to ``high``.
     """
     base, slash, per = unit.partition("/")
+    # "rad/s" is converted as "rad": both have the same factor.
     factor = float(UNITS[OTHER_UNITS[base]][1]) if base in OTHER_UNITS else 0.0
     if not factor or not low <= value * factor <= high:
         return ""
@@ -127,6 +128,8 @@ def parse_number(value: Any, unit: str) -> float:
     """
     match = _QUANTITY.fullmatch(value) if isinstance(value, str) else None
     if match:
+        # Numbers outside the range of floats become 0 or inf, which need no decimal
+        # digits.
         ordinary = 0.0 < abs(float(match[1])) < math.inf
         return _finite(
             Decimal(match[1]) if ordinary else float(match[1]), match[2], value, unit

@@ -94,6 +94,7 @@ def check_dataset(folder: Path) -> list[Finding]:
         ]
     findings, manifest = _check_manifest(folder, spec)
     findings = links + findings
+    # Without a manifest only shards with a sidecar count: others are still to be made.
     entries, finished = shard_entries(manifest), (folder / MANIFEST).exists()
     for task in shards(spec):
         entry = entries.get(task.file)
@@ -154,6 +155,8 @@ def _check_manifest(
             )
         ], {}
     entries, findings = shard_entries(manifest), []
+    # The manifest may be intact by its own checksum and still list shards of another
+    # run.
     if (
         data_fingerprint((file, entry["sha256"]) for file, entry in entries.items())
         != manifest["fingerprint"]
@@ -165,6 +168,7 @@ def _check_manifest(
                 hint=REMAKE_HINT,
             )
         )
+    # Descriptions are listed only if an add-on wrote them.
     for name in (name for name in LISTED if name in manifest["files"]):
         entry = manifest["files"][name]
         if name == CROISSANT and not (folder / name).exists():
@@ -188,6 +192,7 @@ def _check_file(
     path = folder / name
     if not path.is_file():
         return [Finding(name, "is missing", hint=REMAKE_HINT)]
+    # The size is compared first, since the sha256 needs the whole file.
     if size is not None and (actual := path.stat().st_size) != size:
         return [
             Finding(name, f"has {actual} bytes instead of {size}", hint=REMAKE_HINT)
@@ -293,6 +298,7 @@ def check_content(folder: Path, spec: DatasetSpec, task: ShardTask) -> list[Find
         for name, value in expected.items()
         if attributes.get(name) != value
     ]
+    # Arrays of scenes are stored beside the fields of samples.
     names = {field.name for field in spec.fields} | {
         item.name for item in SCENE_ARRAYS if spec.scene_obstacles
     }
@@ -351,6 +357,8 @@ def _extras(folder: Path, spec: DatasetSpec) -> Iterator[Finding]:
         for item in sorted(parent.iterdir()) if parent.is_dir() else ():
             name = item.relative_to(folder).as_posix()
             if name not in known:
+                # A foreign shard in the folder of a split is an error, any other file a
+                # note.
                 loaded = parent != folder and item.suffix == ".h5"
                 text = "is not part of the dataset" + (
                     ", but loaders would read it" if loaded else ""

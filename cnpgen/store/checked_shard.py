@@ -120,6 +120,7 @@ def check_header(shard: Shard) -> dict[str, StoredField]:
     """
     placements, identity = read_placements(shard.path)
     spec, task = shard.spec, shard.task
+    # A shard of an extended dataset has the key of the version that first contained it.
     key = spec.version_with(task).key
     if identity != {
         "specification_key": key,
@@ -142,6 +143,7 @@ def check_field(shard: Shard, item: Field, placement: StoredField | None) -> Non
     if (
         placement is None
         or placement.shape != shape
+        # The byte order of the file does not matter where it is that of the machine.
         or placement.dtype.newbyteorder("<") != dtype
     ):
         actual = (
@@ -162,6 +164,7 @@ def read_columns(
     map would end the process.
     """
     selected = {name: placements[name] for name in names}
+    # Chunked and packed datasets have no single position; HDF5 reads them.
     if any(place.offset is None for place in selected.values()):
         return read_shard(shard.path, list(selected))
     columns: dict[str, NDArray[Any]] = {}

@@ -184,6 +184,7 @@ def _draw_acceptance(
 def _coarsened(density: DensityMap) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """Return candidates and accepted candidates per cell of the finest grid with enough candidates per cell."""
     cells = min(density.candidates.shape)
+    # Cells are merged k by k for the divisors k of the grid, the finest grid first.
     divisors = (k for k in range(1, cells) if cells % k == 0)
     enough = (
         k
@@ -197,6 +198,7 @@ def _coarsened(density: DensityMap) -> tuple[NDArray[np.int64], NDArray[np.int64
 def _summed(counts: NDArray[np.int64], k: int) -> NDArray[np.int64]:
     """Return the sums over k by k cells."""
     nx, ny = counts.shape
+    # Axes 1 and 3 run over the k by k cells that are merged.
     return np.asarray(counts.reshape(nx // k, k, ny // k, k).sum(axis=(1, 3)))
 
 

@@ -228,6 +228,7 @@ class DatasetSpec:
 
         The shard is made from that version.
         """
+        # Splits only grow: the first version with enough rows has the shard.
         end = task.first_row + task.rows
         return next(
             (
@@ -328,6 +329,7 @@ def _check_sizes(spec: DatasetSpec) -> None:
         raise UsageError(
             f"scenes must have at most {MAX_COLUMNS:,} obstacles, got {spec.scene_obstacles}"
         )
+    # The last shard of a split may be partly filled: the division rounds up.
     count = sum(-(-rows // spec.shard_size) for rows in spec.splits.values())
     if count > MAX_SHARDS:
         raise UsageError(
@@ -338,6 +340,7 @@ def _check_sizes(spec: DatasetSpec) -> None:
     if any(rows < 0 for rows in spec.splits.values()) or not any(spec.splits.values()):
         sizes = ", ".join(f"{name} {rows}" for name, rows in spec.splits.items())
         raise UsageError(f"the splits must have rows, got {sizes or 'none'}")
+    # Rows of earlier versions stay in the dataset.
     for smaller, larger in pairwise((*spec.previous_splits, spec.splits)):
         if any(
             not 0 <= rows <= larger.get(split, 0) for split, rows in smaller.items()
@@ -358,6 +361,7 @@ def _check_names(spec: DatasetSpec) -> None:
             f"the fields must have different names, from 1 to {MAX_FIELDS:,}, got {names!s:.200}"
         )
     for item in spec.fields:
+        # A scalar field has one column and the width 0.
         widths = {
             len(part) for part in (item.valid_min, item.valid_max) if part is not None
         }
@@ -388,6 +392,8 @@ def shards(spec: DatasetSpec) -> list[ShardTask]:
     tasks = []
     for split, rows in spec.splits.items():
         previous = {splits.get(split, 0) for splits in spec.previous_splits}
+        # Shards begin at multiples of the size, and where an earlier version ended: its
+        # last shard keeps its bytes.
         first_rows = sorted(
             {
                 *range(0, rows, spec.shard_size),
@@ -492,6 +498,8 @@ def load_dataset_spec(folder: Path) -> DatasetSpec:
         structure=SPECIFICATION_STRUCTURE,
     )
     spec = from_json(document)
+    # The checksum protects the text; the fingerprint, the meaning that this version
+    # reads.
     if spec.fingerprint != document.get("fingerprint"):
         raise DatasetError(
             f"{path} is damaged: its fingerprint does not match its content"

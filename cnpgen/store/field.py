@@ -57,6 +57,7 @@ class Field:
     @property
     def columns(self) -> tuple[str, ...]:
         """Names of the columns in a table of several fields: ``"start_q.joint_1"``, or ``"hit_speed"`` of a scalar."""
+        # Columns without names are numbered.
         names = self.names or tuple(map(str, range(self.width)))
         return (
             tuple(f"{self.name}.{name}" for name in names)

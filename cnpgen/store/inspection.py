@@ -176,6 +176,7 @@ def _yield(sampling: SamplingStatistics) -> dict[str, Any]:
     """Return the numbers of candidates and, in pipeline order, of rejections with the fractions that remain."""
     tried, left, steps = max(sampling.tried, 1), sampling.tried, []
     for reason, count in sampling.rejections.items():
+        # Each reason removes its candidates from those that earlier stages left.
         left -= count
         stage = sampling.stages.get(reason, "")
         steps.append(

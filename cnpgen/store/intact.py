@@ -59,6 +59,7 @@ def require_intact(path: Path, *, size: int, sha256: str) -> None:
     """
     if problem := size_problem(path, size):
         raise DatasetError(f"{problem}; {RERUN_HINT}")
+    # A changed file has another time: it is verified again.
     identity = (path.absolute(), path.stat().st_mtime_ns, size, sha256)
     if identity in _verified:
         return

@@ -25,6 +25,7 @@ def units_of_joints(revolute_unit: str, is_prismatic: tuple[bool, ...]) -> str:
         _PRISMATIC[revolute_unit] if prismatic else revolute_unit
         for prismatic in is_prismatic
     ]
+    # Robots with one kind of joints have one short unit.
     return units[0] if len(set(units)) == 1 else _SEPARATOR.join(units)
 
 

@@ -60,6 +60,8 @@ def finalize(
     """
     summary = summarize_dataset(folder, spec)
     created = _created(summary)
+    # Without a manifest the dataset counts as unfinished while its documents are
+    # replaced.
     (folder / MANIFEST).unlink(missing_ok=True)
     save_document(folder / STATS, stats_document(summary))
     for document in documents:
@@ -67,6 +69,7 @@ def finalize(
             summary, created=created, folder=_name(folder), notes=notes
         )
         write_file(folder / document.file, text)
+    # Last: the manifest contains the sha256 of all other documents.
     manifest = _manifest(folder, summary, created=created)
     save_document(folder / MANIFEST, manifest)
     remove_all_temporary(folder / WORK)
@@ -166,6 +169,7 @@ def _created(summary: DatasetSummary) -> str:
             for _, record in summary.records
             if record.started
         ]
+        # Records, not the clock: finalizing again gives the same bytes.
         last = max((instant.timestamp() for instant in started), default=time.time())
         instant = datetime.fromtimestamp(int(last), UTC) if fixed is None else fixed
         return instant.strftime("%Y-%m-%dT%H:%M:%SZ")
@@ -209,6 +213,7 @@ def data_fingerprint(files: Iterable[tuple[str, str]]) -> str:
 
     ``sha256sum */shard-*.h5 | sha256sum`` prints it in the dataset folder.
     """
+    # The format of sha256sum, whose lines can be checked by hand.
     lines = "".join(f"{sha256}  {file}\n" for file, sha256 in sorted(files))
     return hashlib.sha256(lines.encode()).hexdigest()
 

@@ -65,6 +65,7 @@ def require_file(
     """
     require_path(path, expected, argument=argument)
     if path.is_dir():
+        # The folder of a dataset is a common mistake, with a remedy of its own.
         actual, hint = (
             ("the folder of a dataset", of_dataset)
             if is_dataset(path)
@@ -111,6 +112,7 @@ def similar_path(path: Path, names: Iterable[str] = ()) -> str:
             *(
                 each.name
                 for each in beside
+                # Only files of the same kind, and folders, are meant.
                 if path.suffix in ("", each.suffix) or each.is_dir()
             ),
         ]

@@ -45,6 +45,7 @@ class StoredDataset:
             )
         tasks = [task for task in shards(self.spec) if task.split == split]
         if self.manifest is None:
+            # Without a manifest shards may be missing between others.
             return [
                 task for task in tasks if is_committed(self.folder, self.spec, task)
             ]
@@ -73,6 +74,7 @@ class StoredDataset:
             raise DatasetError(
                 f"split {split!r} has rows 0 to {rows}, got {start} to {stop}"
             )
+        # An empty first part gives shape and type to a selection without rows.
         parts: dict[str, list[NDArray[Any]]] = {
             name: [self._no_rows(name)] for name in names
         }
@@ -107,6 +109,7 @@ class StoredDataset:
             raise DatasetError(
                 f"split {split!r} of {self.folder} has no rows {start} to {end}"
             )
+        # Adjacent shards may share a scene.
         return distinct_scenes(tables)
 
     def shard(self, task: ShardTask) -> Shard:

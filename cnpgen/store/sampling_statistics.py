@@ -134,6 +134,8 @@ def _merged_order(first: Sequence[str], second: Sequence[str]) -> list[str]:
     merged = list(first)
     for position, reason in enumerate(second):
         if reason not in merged:
+            # A reason that is new follows its predecessor in the other order, so that
+            # the order of stages is kept.
             merged.insert(
                 merged.index(second[position - 1]) + 1 if position else 0, reason
             )

@@ -141,6 +141,8 @@ class SceneTable:
 
         An unknown scene ID raises DatasetError.
         """
+        # scene_ids ascend; an ID above the last one is compared with the last scene and
+        # refused.
         rows = np.minimum(
             np.searchsorted(self.scene_ids, scene_id), max(len(self) - 1, 0)
         )
@@ -176,6 +178,7 @@ def concatenate_scenes(tables: Sequence[SceneTable]) -> SceneTable:
 def distinct_scenes(tables: Sequence[SceneTable]) -> SceneTable:
     """Return the scenes of consecutive shards, each once: a scene may have its last samples in the next shard."""
     table = concatenate_scenes(tables)
+    # The first occurrence of each ID, in ascending order.
     return table[np.unique(table.scene_ids, return_index=True)[1]]
 
 
@@ -207,6 +210,7 @@ def check_scenes(
         raise DatasetError(
             "scene_ids are not the scene_id of the samples, each once and ascending"
         )
+    # Mask of the entries that are obstacles; the others are padding.
     real = np.arange(obstacles) < table.obstacle_count[:, None]
     kind, sizes = table.obstacle_kind, table.obstacle_size
     norms = np.linalg.norm(table.obstacle_quaternion.astype(float), axis=-1)
@@ -220,9 +224,11 @@ def check_scenes(
                 real, (kind < 0) | (kind >= len(OBSTACLE_KINDS)), kind != NO_OBSTACLE
             )
         ).any(axis=1),
+        # Each shape has a positive first size; unused sizes are zero.
         "obstacle_size": ((sizes < 0).any(axis=-1) | (real & ~(sizes[..., 0] > 0))).any(
             axis=1
         ),
+        # Norms of float32 differ from 1 by rounding; the comparison is false for nan.
         "obstacle_quaternion": ~(np.abs(norms - 1) <= 1e-5).all(axis=1),
         "numbers": ~np.all(
             [np.isfinite(each).all(axis=(1, 2)) for each in values], axis=0

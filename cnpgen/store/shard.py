@@ -85,6 +85,7 @@ def write_shard(
     content = _encode(parts, attributes)
     with committing(path, work) as temporary:
         temporary.write_bytes(content)
+        # A file that cannot be read is never renamed.
         with open_hdf5(temporary) as file:
             shapes = {name: item.shape for name, item in file.columns().items()}
         expected = {field.name: field.shape(rows) for field in fields}

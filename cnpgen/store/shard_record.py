@@ -187,6 +187,7 @@ def commit_shard(
         record = ShardRecord(
             file=task.file,
             bytes=size,
+            # The sha256 is that of the file as the disk returns it, not of the buffer.
             sha256=file_sha256(path),
             rows=task.rows,
             first_sample_id=task.first_row,
@@ -220,6 +221,7 @@ def load_committed(folder: Path, spec: DatasetSpec, task: ShardTask) -> ShardRec
         text = f"{folder / task.sidecar} belongs to another specification ({record.specification_fingerprint[:12]}...)"
         raise DatasetError(text)
     path = folder / task.file
+    # The size is a quick check; the sha256 is compared where rows are read.
     size = path.stat().st_size if path.is_file() else None
     if size != record.bytes:
         problem = (

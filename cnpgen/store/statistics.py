@@ -73,6 +73,8 @@ class FieldStatistics:
         if self.mean.shape != other.mean.shape or not all(ranges):
             raise DatasetError("statistics of different fields cannot be merged")
         count = self.count + other.count
+        # With d = mean2 - mean1: mean = mean1 + d n2 / n, m2 = m2_1 + m2_2 + d^2 n1 n2
+        # / n. No large squares are subtracted.
         delta = other.mean - self.mean
         return FieldStatistics(
             count=count,
@@ -201,9 +203,11 @@ def _limits(field: Field, columns: int) -> tuple[Floats, Floats] | tuple[None, N
 
 def _histogram(columns: Floats, low: Floats, high: Floats) -> NDArray[np.int64]:
     """Count the rows of every column, shape (c, rows), in its bins, shape (c, 64)."""
+    # A column with equal limits has all rows in one bin.
     width = np.where(high > low, high - low, 1.0)
     positions = (columns - low[:, None]) / width[:, None] * N_BINS
     # Rounds down, since no position is negative.
+    # Values at or outside the limits count in the outer bins.
     bins = np.clip(positions, 0, N_BINS - 1).astype(np.int64)
     return np.array([np.bincount(row, minlength=N_BINS) for row in bins])
 

@@ -58,6 +58,7 @@ def find_workspace(folder: Path) -> Workspace:
         existing = next(path for path in above if path.exists())
         if not existing.is_dir():
             return Workspace(folder, existing, "a file")
+        # A missing folder, or one with temporary files only.
         if existing != above[0] or all(item.name == WORK for item in folder.iterdir()):
             return Workspace(folder, existing, "nothing")
     if not is_dataset(folder):
@@ -87,6 +88,7 @@ def check_place(workspace: Workspace) -> None:
         outside := outside_links(workspace.folder, (WORK, *splits))
     ):
         raise UsageError(f"{workspace.folder / outside[0]} {OUTSIDE}; {COPY_HINT}")
+    # A finished dataset may be read-only: it is only checked.
     if (workspace.folder / MANIFEST).is_file():
         return
     check_writable(workspace.folder)
@@ -130,6 +132,7 @@ def open_workspace(
     if begun is None:
         with machine_errors("write to", folder):
             folder.mkdir(parents=True, exist_ok=True)
+            # Summaries of a dataset without shards belong to another one.
             for name in _SUMMARIES:
                 (folder / name).unlink(missing_ok=True)
         write_dataset_spec(folder, spec)
@@ -140,6 +143,8 @@ def open_workspace(
 def require_dataset_spec(folder: Path, spec: DatasetSpec) -> None:
     """Raise an error if another process has replaced or deleted the dataset in a folder."""
     try:
+        # The fingerprint stands in the text: parsing the document for every shard is
+        # not needed.
         is_unchanged = spec.fingerprint.encode() in read_file(folder / SPECIFICATION)
     except DatasetError as error:
         missing = f"its {SPECIFICATION}" if folder.is_dir() else "it"
@@ -254,6 +259,7 @@ def check_clearable(workspace: Workspace) -> list[Path]:
     folder, spec = workspace.folder, workspace.spec
     named = sorted({path.parent for path in _shard_files(folder)})
     if spec is not None:
+        # With a specification the splits are known, even those without shards.
         named = [folder / split for split in spec.splits]
     splits = [split for split in named if split.is_dir()]
     if foreign := _foreign(folder, splits):

@@ -41,8 +41,12 @@ class Adam:
         The decay ``memory`` of the average is smaller during the first steps.
         """
         self.step += 1
+        # The memory of the average grows from 2 / 11 to its limit, so that it forgets
+        # the initial parameters.
         new = 1 - min(memory, (1 + self.step) / (10 + self.step))
         scratch = np.empty(min(PARAMETERS_PER_BLOCK, len(gradient)), gradient.dtype)
+        # The corrected moments are m / (1 - b1^t) and v / (1 - b2^t). Both corrections
+        # become factors of the step and of epsilon.
         bias = np.sqrt(1 - BETA_2**self.step)
         factor = rate * bias / (1 - BETA_1**self.step)
         for start in range(0, len(gradient), PARAMETERS_PER_BLOCK):
@@ -72,17 +76,21 @@ class Adam:
             self.parameters[part],
         )
         average, work = self.average[part], scratch[: len(gradient)]
+        # m = b1 m + (1 - b1) g
         first *= BETA_1
         first += np.multiply(gradient, 1 - BETA_1, out=work)
+        # v = b2 v + (1 - b2) g^2
         second *= BETA_2
         np.multiply(gradient, gradient, out=work)
         work *= 1 - BETA_2
         second += work
+        # p = p - factor m / (sqrt(v) + epsilon)
         np.sqrt(second, out=work)
         work += epsilon
         np.divide(first, work, out=work)
         work *= factor
         parameters -= work
+        # average = average + new (p - average)
         np.subtract(parameters, average, out=work)
         work *= new
         average += work
@@ -125,6 +133,7 @@ class Clipping:
         half of the gradients of every batch are zero.
         """
         median = float(np.median(norms))
+        # The running median is that of the batches so far; the first one starts it.
         self.sample = (
             SAMPLE_MEMORY * self.sample + (1 - SAMPLE_MEMORY) * median
             if self.sample
@@ -132,6 +141,8 @@ class Clipping:
         )
         if not self.sample or np.isinf(limit):
             return np.ones_like(norms)
+        # A gradient longer than limit times the running median is shortened to this
+        # length.
         return np.minimum(1.0, limit * self.sample / np.maximum(norms, 1e-30)).astype(
             norms.dtype
         )
@@ -143,6 +154,7 @@ class Clipping:
         """
         self.batch = (
             BATCH_MEMORY * self.batch
+            # A single large norm does not raise the limit for the batches after it.
             + (1 - BATCH_MEMORY) * min(norm, MAX_NORM_RATIO * self.batch)
             or norm
         )

@@ -60,6 +60,7 @@ class Sums:
 
         Plans without a finite loss are counted and omitted.
         """
+        # Plans whose loss is not finite are counted, not averaged.
         finite: NDArray[np.bool_] = np.asarray(np.isfinite(terms).all(axis=1))
         if finite.any():
             self.terms += terms[finite].mean(axis=0, dtype=np.float64)
@@ -180,6 +181,8 @@ class Checkpoints:
 
     def __init__(self, path: Path, identity: Mapping[str, Any]) -> None:
         self.path = path
+        # In the form in which it is read back, so that equal identities compare as
+        # equal.
         self.identity: dict[str, Any] = json.loads(json.dumps(identity))
         self._next = time.monotonic() + MIN_INTERVAL_S
 
@@ -237,6 +240,8 @@ class Checkpoints:
         write_with_checksum(
             self.path, content, kind=CHECKPOINT_KIND, version=CHECKPOINT_VERSION
         )
+        # Writing takes at most a twentieth of the time, within the bounds of the
+        # interval.
         interval = INTERVAL_PER_WRITING_TIME * (time.monotonic() - started)
         self._next = time.monotonic() + min(
             max(MIN_INTERVAL_S, interval), MAX_INTERVAL_S

@@ -159,6 +159,7 @@ class SceneRows(TrainingData):
         training = slice(0, len(self.boundary) - self.n_validation)
         start, goal = self.boundary.start_q[training], self.boundary.goal_q[training]
         zero = np.zeros((2 * len(start), start.shape[1]))
+        # From rest to rest, each problem reversed is one, too.
         there, back = np.concatenate([start, goal]), np.concatenate([goal, start])
         return TrainingProblems(
             Boundary(there, zero, zero, back, zero),
@@ -166,6 +167,7 @@ class SceneRows(TrainingData):
         )
 
     def _validation(self, first: int, stop: int) -> TrainingProblems:
+        # Validation rows are the last ones, and not multiplied.
         offset = len(self.boundary) - self.n_validation
         rows = slice(offset + first, offset + stop)
         return TrainingProblems(self.boundary[rows], self.obstacle_poses[rows])
@@ -243,6 +245,7 @@ def open_training_data(
         raise DatasetError(
             f"{folder} needs a split to train on and another one to validate with, it has {names}"
         )
+    # Splits of other names: the first trains, the second validates.
     train = "train" if "train" in names else names[0]
     others = [name for name in names if name != train]
     validation = "validation" if "validation" in others else others[0]

@@ -79,11 +79,13 @@ def prepare_run(
     if initial_model is None:
         blocks, features = _initial_features(loaded, settings, boundary)
     else:
+        # Features and via points belong to the parameters that the run starts from.
         config = replace(config, via_points=initial_model.config.via_points)
         blocks, features = initial_model.features.blocks, initial_model.features
     inference = make_inference_pipeline(
         loaded,
         config,
+        # Only motions from rest to rest may be slowed without a change of their ends.
         scale_time=is_rest_to_rest(zero, fixed),
         fixed_at_goal=fixed,
         observed=SCENE in blocks,
@@ -190,6 +192,7 @@ def input_ranges(
         None if initial_model is None else initial_model.training.get("input_ranges")
     )
     if earlier is not None:
+        # The parameters have been trained on the inputs of both runs.
         low, high = np.minimum(low, earlier["low"]), np.maximum(high, earlier["high"])
     return {
         name: [float(f"{value:.8g}") for value in values.tolist()]
@@ -268,6 +271,8 @@ def _architecture(
         "batch_size", settings.batch_size, settings.batch_size * settings.nodes
     )
     spec = loaded.problem.trajectory
+    # Boundary conditions fix three control points at the start and fixed_at_goal at the
+    # goal.
     outputs = loaded.robot.n * (spec.path_control_points - 3 - boundary.fixed_at_goal)
     return Architecture(
         inputs=count_features(
@@ -302,6 +307,7 @@ def _metric(loss: PlanLoss, settings: TrainingSettings) -> Metric:
         loss.weights0 if learned else suggested_weights(loss.problem, loss.weights0)
     )
     if settings.constraint_terms == "budgeted":
+        # Constraints without a budget are left out of the loss.
         weights = np.where(loss.budgets > 0, weights, 0.0)
     return Metric(weights, loss.budgets, settings.metric)
 
@@ -337,13 +343,16 @@ def _fresh(run: Run, steps: int) -> State:
 def _step_seconds(run: Run) -> float:
     """Measure the CPU time of a step [s], on a temporary state."""
     state, metric = _fresh(run, 10_000), run.metric.state()
+    # The time of a step is that of the loss, not of imitation.
     state.imitating = 0
     gradient, times = np.empty_like(state.adam.parameters), []
     for _ in range(WARM_UP_STEPS + TIMED_STEPS):
         started = time.process_time()
         run.step(state, gradient)
         times.append(time.process_time() - started)
+    # The measurement leaves no trace in the metric.
     run.metric.load_state(metric)
+    # The first steps fill caches, and the median ignores interruptions.
     return float(np.median(times[WARM_UP_STEPS:]))
 
 
@@ -382,5 +391,7 @@ def validate(
             for name, condition in summary["conditions"].items()
             if condition["violating_plans"]
         },
+        # A percentage point of valid plans counts as much as one percent of the
+        # duration.
         "score": summary["valid_ratio"] - math.log(duration),
     }

@@ -72,6 +72,7 @@ def with_via_points(
     candidates = np.concatenate(
         [random.uniform(lower, upper, (n_random, len(lower))), on_plans]
     )
+    # Each candidate is judged by the plans that it repairs.
     violating = boundary[np.flatnonzero(~satisfied)[:MAX_VIOLATING_PLANS]]
     repaired = [
         _planned(model, inference, violating, np.tile(q, (len(violating), 1)))[1]
@@ -97,6 +98,7 @@ def _planned(
     tasks = inference.prepare(boundary, via_point)
     motion = inference.motion(model, tasks)
     assert inference.via_points is not None
+    # Violations are relative to the tolerances.
     return motion, inference.via_points.violation(motion, tasks.scene.poses) <= 1
 
 
@@ -104,6 +106,8 @@ def _greedy_cover(repaired: NDArray[np.bool_], count: int) -> list[int]:
     """Return rows of a table whose union has most columns, selected greedily."""
     selected, remaining = list[int](), np.ones(repaired.shape[1], bool)
     while len(selected) < count and repaired[:, remaining].any():
+        # Greedy maximum coverage: the candidate that repairs most of the plans that are
+        # still violating.
         selected.append(int(repaired[:, remaining].sum(axis=1).argmax()))
         remaining &= ~repaired[selected[-1]]
     return selected

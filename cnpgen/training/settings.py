@@ -152,6 +152,8 @@ class TrainingSettings:
                     f"must be one of {known}, got {getattr(self, name)!r}",
                     argument=name,
                 )
+        # Later evaluations start from the path of the one before, which these features
+        # do not contain.
         if self.iterations > 1 and self.features in {"states", "paper"}:
             raise UsageError(
                 f"{self.iterations} evaluations of the network need its path as an input: expected features"

@@ -24,6 +24,8 @@ def imitation_loss(points: ControlPoints, target: ControlPoints) -> LossValue:
 
     The distances are ``total`` and the only column of ``terms``.
     """
+    # L = (|p - p*|^2 + |log r - log r*|^2) / 2; dL/dp = p - p*, dL/dr = log(r / r*) /
+    # r.
     by_path = points.path - target.path
     logs = np.log(points.rate / target.rate)
     total = 0.5 * (
@@ -123,6 +125,8 @@ class Learner:
             value = cost(rows, projected)
             phi, log_rate = self._output_gradients(rows, points, value)
             factors = self._factors(phi, log_rate, clipping)
+            # The factor of a sample scales both heads: the direction of its gradient
+            # stays.
             phi *= factors
             log_rate *= factors
             gradients = self.architecture.split(part)
@@ -133,6 +137,8 @@ class Learner:
                 log_rate_gradient=log_rate,
                 out=gradients,
             )
+            # The loss is the sum over the evaluations of the network, each with its own
+            # line.
             if iteration:
                 out += part
             if iteration + 1 < self.settings.iterations:
@@ -147,6 +153,7 @@ class Learner:
         tasks = self.along(rows.tasks, path)
         return replace(
             rows,
+            # The observation is part of the features.
             tasks=replace(tasks, observation=None),
             features=self.features.of(tasks),
         )
@@ -160,6 +167,7 @@ class Learner:
             for gradient in (value.path_gradient, value.rate_gradient)
         )
         if self.projection is not None:
+            # The gradient is carried back through the projection: g^T dP/dp.
             by_path = self.projection.vjp(points.path, rows.tasks.scene.poses, by_path)
         scale = self.settings.path_scale
         return vjp(
@@ -190,9 +198,11 @@ class Learner:
         )
         usable = np.isfinite(norms)
         if not usable.all():
+            # Samples without a finite gradient take no part in the step.
             phi[~usable], log_rate[~usable] = 0, 0
             norms = np.where(usable, norms, 0)
         factors = clipping.sample_factors(norms, limit=self.settings.sample_clip)
+        # The mean over the batch.
         return (factors / len(factors))[:, None]
 
     def update(
@@ -207,4 +217,5 @@ class Learner:
             gradient *= clipping.batch_factor(norm, limit=self.settings.batch_clip)
             adam.update(gradient, rate=rate, memory=self.settings.memory)
         else:
+            # The step counts, so that batches and learning rates go on.
             adam.step += 1

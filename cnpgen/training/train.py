@@ -129,6 +129,8 @@ def train_model(
         out.with_suffix(CHECKPOINT), identity(source, settings) | run_identity
     )
     if not force:
+        # A checkpoint is removed after its model is saved: without one the run is
+        # finished.
         if out.exists() and not checkpoints.path.exists():
             return _finished(out, checkpoints.identity)
         check_beside(out)
@@ -151,6 +153,8 @@ def train_model(
             check_rows=check_rows,
             command=chosen.command,
         )
+        # The checkpoint is read after the kernels: their compilation may raise errors,
+        # too.
         state = checkpoints.load(discard=force) or begin_run(run, length)
         clock.prepared()
         if chosen.begin is not None:
@@ -159,6 +163,8 @@ def train_model(
         run.train(state, checkpoints, log, chosen.watch)
         checkpoints.save(state)
         best = run.model(state.best.parameters)
+        # Other rows than those that selected the best model, so that the score has no
+        # selection bias.
         score = validate(
             best,
             inference,

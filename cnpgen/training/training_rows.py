@@ -70,6 +70,7 @@ def prepare_rows(
     """
     parts = [
         slice(first, first + PREPARED_ROWS_PER_BLOCK)
+        # At least one block, which gives shapes to empty arrays.
         for first in range(0, max(len(boundary), 1), PREPARED_ROWS_PER_BLOCK)
     ]
     # Features do not depend on the projected line, which takes most of the time.
@@ -147,6 +148,8 @@ class StepRows:
 
     def batch(self, step: int) -> NDArray[np.int64]:
         """Return the rows of the batch of one step, shape (batch_size,)."""
+        # The order of an epoch follows from seed and epoch, so that a resumed run
+        # continues it.
         epoch, index = divmod(step, self.batches)
         if epoch != self._epoch:
             self._epoch, self._order = (

@@ -65,6 +65,8 @@ class Run:
             self.metric.load_state(state.metric)
         gradient = np.empty_like(state.adam.parameters)
         while state.adam.step < state.steps:
+            # A signal ends the loop between two steps, with a checkpoint of a
+            # consistent state.
             with signals_deferred() as waiting:
                 while state.adam.step < state.steps and not waiting.came:
                     self._train_step(state, gradient, log, watch)
@@ -113,6 +115,7 @@ class Run:
             out=gradient,
         )
         self.metric.observe(terms, progress)
+        # The step is counted by the optimizer, after the gradient.
         if (state.adam.step + 1) % self.order.batches == 0:
             self.metric.end_epoch(progress)
         state.metric = self.metric.state()
@@ -141,6 +144,7 @@ class Run:
         """Return the means of the terms since the last line."""
         sums, step = state.sums, state.adam.step
         state.sums = Sums(np.zeros_like(sums.terms))
+        # The run diverges if more than half of the plans have no finite loss.
         if sums.lost > sums.steps * self.order.batch_size // 2:
             raise MachineError(
                 f"the loss of most plans is not finite at step {step}: try a smaller {{learning_rate}}",
@@ -162,6 +166,7 @@ class Run:
             self.metric.weights(state.progress(state.adam.step - 1)),
         )
         return {
+            # L = task loss + sum of weight times constraint term
             "loss": float(means[0] + means[1:] @ weights),
             "terms": dict(zip(self.names, means.tolist(), strict=True)),
             "weights": dict(zip(self.names[1:], weights.tolist(), strict=True)),
@@ -184,4 +189,5 @@ class Run:
 
 def _is_due(step: int, steps: int, times: int) -> bool:
     """Return whether an event that happens ``times`` times per run is due after this step."""
+    # Events are spread evenly: floor(step times / steps) rises by one at each.
     return step * times // steps > (step - 1) * times // steps

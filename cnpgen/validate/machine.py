@@ -187,6 +187,8 @@ def _check_libraries(findings: _Findings) -> dict[str, str]:
             [f"{problem}, for 'cnpgen inspect --plot' only"] if problem else []
         )
     if hint := foreign_path_hint():
+        # Foreign paths are the probable cause of broken libraries, hence first; without
+        # problems they are a note.
         (findings.problems if findings.problems else findings.notes).insert(0, hint)
     return versions
 
@@ -220,6 +222,7 @@ def _check_cores(findings: _Findings) -> tuple[int, int]:
     """Return the number of available cores and of all cores."""
     present = os.cpu_count() or 1
     available = (
+        # Schedulers of clusters may restrict a process to some cores.
         len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else present
     )
     try:
@@ -354,6 +357,7 @@ def _check_recipes(findings: _Findings) -> str:
         for name in names:
             try:
                 load_robot(load_dataset_recipe(name).pipeline.problem)
+            # Robots of optional packages are no defect of the installation.
             except PluginError:
                 missing.append(name)
     except Exception as error:  # noqa: BLE001 - broken libraries raise anything

@@ -64,6 +64,7 @@ def regenerate_blocks(
     backend, cache_folder = backend_of(folder, spec)
     # Without the manifest, which may be damaged.
     dataset = StoredDataset(folder, spec, None)
+    # Other blocks at each call: repeated checks cover more of the dataset.
     chosen = np.random.default_rng().permutation(len(blocks))[:count]
     identical, findings = 0, []
     with restored(spec) as recipe:
@@ -73,6 +74,7 @@ def regenerate_blocks(
                 f"the blocks of {folder} have {size} rows, those of this version {prepared.block_rows}"
             )
         for task, block in (blocks[index] for index in chosen):
+            # A block may overlap several shards: only its part in this one is compared.
             start = max(block * size, task.first_row)
             stop = min((block + 1) * size, task.first_row + task.rows)
             part = ShardTask(task.split, task.index, start, stop - start)
@@ -120,6 +122,7 @@ def _compare(stored: dict[str, Any], again: dict[str, Any]) -> tuple[bool, str]:
             else MAX_REGENERATION_ERROR
         )
         if not (
+            # Indices and identifiers must be equal.
             difference <= (0.0 if values.dtype.kind == "i" else float_tolerance)
         ).all():
             return same, f"{name} differs by {difference.max():.3g}"
@@ -280,10 +283,12 @@ def validate_dataset(
         # Missing packages and backends are reported before the expensive checks.
         backend_of(folder, spec)
     if deep or regenerate:
+        # A recipe that cannot be restored is reported before the expensive checks.
         with restored(spec):
             pass
     existing = [task for task in shards(spec) if is_committed(folder, spec, task)]
     damaged = {finding.file for finding in findings if not finding.note}
+    # A damaged shard is a finding already; HDF5 may hang on it.
     undamaged = [task for task in existing if task.file not in damaged]
     findings += check_recipe(spec) + (check_statistics(folder, spec) if deep else [])
     checked = (

@@ -69,6 +69,7 @@ def check_rows(
                 checks.append(result)
                 if progress is not None:
                     progress(task.rows)
+    # Equal rows have equal keys; 64 bits make equal keys of different rows improbable.
     keys = np.concatenate([np.empty(0, np.uint64), *(check.keys for check in checks)])
     n_duplicates = len(keys) - len(np.unique(keys))
     if n_duplicates:
@@ -183,6 +184,8 @@ def row_keys(values: NDArray[Any]) -> NDArray[np.uint64]:
     bits = np.ascontiguousarray(values, np.float64).view(np.uint64)
     # float32 values have zero low bits, which products would not mix
     bits = bits ^ (bits >> np.uint64(32))
+    # Multiplication by an odd number is a bijection of 64 bits; each column has its
+    # own.
     bits *= np.resize(_ODD_MULTIPLIERS, bits.shape[1])
     bits ^= bits >> np.uint64(29)
     return np.asarray(
@@ -232,6 +235,7 @@ def _check_range(
         ("valid_max", field.valid_max, -1.0),
     ):
         if bound is not None:
+            # min - x for lower bounds, x - max for upper ones.
             violation = sign * (np.array(bound) - values.reshape(len(values), -1))
             rows = np.flatnonzero(
                 (violation > tolerance(np.array(bound), dtype)).any(axis=1)
@@ -270,6 +274,8 @@ def _agree(a: FieldStatistics, b: FieldStatistics) -> bool:
     exact = ("count", "minimum", "maximum", "low", "high", "histogram")
     if not all(np.array_equal(getattr(a, name), getattr(b, name)) for name in exact):
         return False
+    # Sums of n numbers up to s in size round relative to n s, their squares relative to
+    # n s^2.
     spread = np.maximum(np.abs(a.minimum), np.abs(a.maximum))
     mean, m2 = (
         MAX_RELATIVE_SUM_ERROR * spread,

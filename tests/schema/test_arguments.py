@@ -245,3 +245,8 @@ def test_a_recipe_from_no_file_has_no_card(tmp_path: Path) -> None:
         name="own", pipeline=load_pipeline("airhockey-hit"), splits={"train": 20}
     )
     assert make_dataset(recipe, tmp_path / "out", workers=1).complete
+
+
+def test_an_integer_beyond_floats_is_no_finite_number() -> None:
+    with pytest.raises(UsageError, match="rate must be a finite number, got 1000"):
+        number("rate", 10**400)

@@ -251,6 +251,7 @@ def onto_table(robot: Robot, *, height: float) -> Any:
     row = [c[2] for c in kin.jacobian]
     # Only the component along J_z leaves the manifold: J_z dq = 0.
     dq = _project(dq, row, limit)
+    # Largest ratio of a velocity to its limit.
     over = ca.mmax(
         ca.vertcat(*[ca.fabs(x) / bound for x, bound in zip(dq, limit, strict=True)])
     )
@@ -329,6 +330,7 @@ def table_acceleration(robot: Robot) -> Any:
     particular = [
         share * bound * ca.sign(x) for bound, x in zip(limit, row, strict=True)
     ]
+    # A direction within the manifold: J_z u = 0, so that every t keeps the constraint.
     direction = _project(
         [x * bound for x, bound in zip(u, limit, strict=True)], row, limit
     )

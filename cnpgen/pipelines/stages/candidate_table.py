@@ -41,6 +41,7 @@ def upright_axes(context: Context, candidates: CandidateBatch) -> list[Array]:
     ranges = context.problem.parameters
     if not ranges.turns_upright:
         return []
+    # Three axes of three components, one column for each candidate.
     axes = table_frame.upright_axes(ranges, candidates["parameters"].T)
     return [np.ascontiguousarray(axes.reshape(len(axes), 9).T)]
 
@@ -93,6 +94,7 @@ def hit_direction(context: Context, candidates: CandidateBatch) -> Array:
 def table_normal(context: Context, candidates: CandidateBatch) -> list[Array]:
     """Return the normal of the table of every candidate, shape (3, n), in a list that is empty for unmoved tables."""
     frame = candidate_table(context, candidates)
+    # The normal is the z axis of the table's frame.
     return [] if frame is None else [np.ascontiguousarray(frame.axes[..., 2].T)]
 
 

@@ -69,6 +69,7 @@ class Collision(Stage):
         clearance = context.constraint(RobotClearance)
         if context.robot.shape is not None:
             return self._by_convex_parts(context, clearance.distance)
+        # Without geometry of links the robot is the paper's capsules.
         radius = clearance.radius or 0.0
         if self.judge == "coal":
             return self._by_coal(context, radius + clearance.distance)
@@ -97,6 +98,7 @@ class Collision(Stage):
     def _by_convex_parts(self, context: Context, distance: float) -> StageFunction:
         kernel = context.kernels.load_by_structure(capsule_clearance)
         with_object = self.judge == "coal"
+        # Without Coal the stage checks the links only.
         depth = _contact_depth(context) if with_object else 0.0
         problem = (
             context.problem if with_object else replace(context.problem, object=None)
@@ -244,6 +246,8 @@ def coal_judge(problem: Problem, robot: Robot, radius: float, depth: float) -> A
         else _add_capsules(geometry, robot, radius)
     )
     if problem.object is not None:
+        # Legal contacts are at most this deep on each side: a box smaller by the depth
+        # must be free.
         size = np.array(problem.object.size) - 2 * depth
         frame = model.frames[robot.tip_frame]
         box = pin.GeometryObject(
@@ -254,6 +258,7 @@ def coal_judge(problem: Problem, robot: Robot, radius: float, depth: float) -> A
     pool = pin.GeometryPool(model, geometry, 1)
 
     def judge(q: Array, obstacle_poses: Array) -> NDArray[np.bool_]:
+        # Positions of the sliding joints of the obstacles follow those of the robot.
         states = np.asfortranarray(np.concatenate([q, obstacle_poses[heights]]))
         return np.asarray(
             pin.computeCollisionsInParallel(1, pool, states, True)
@@ -311,6 +316,7 @@ def _add_convex_parts(geometry: Any, shape: Shape, distance: float) -> list[int]
     added: list[int] = []
     for part in shape.moving_convex_parts:
         hull, name = coal_hull(part.vertices), f"{part.link}_{len(added)}"
+        # A body inflated by the distance collides exactly if the distance is not kept.
         hull.setSweptSphereRadius(part.radius + distance)
         solid = pin.GeometryObject(
             name, shape.joints[part.link], 0, pin.SE3.Identity(), hull
@@ -347,6 +353,7 @@ def _add_capsules(geometry: Any, robot: Robot, radius: float) -> list[int]:
         turn = pin.Quaternion.FromTwoVectors(
             np.array([0.0, 0.0, 1.0]), (second - first) / length
         ).toRotationMatrix()
+        # Capsules of Coal are along z about their center.
         placement = pin.SE3(turn, (first + second) / 2)
         capsule = pin.GeometryObject(
             f"capsule_{a}_{b}", joint, 0, placement, coal.Capsule(radius, length)

@@ -63,6 +63,7 @@ class DrawPositions(Stage):
         def work(candidates: CandidateBatch, random: np.random.Generator) -> None:
             candidates["start_xyz"] = uniform(candidates.draw(random, 3), self.start)
             candidates["goal_xyz"] = uniform(candidates.draw(random, 3), self.goal)
+            # Measured in the frame of the table, before positions move to the world.
             distance = np.hypot(*(candidates["goal_xyz"] - candidates["start_xyz"])[:2])
             for end in ("start_xyz", "goal_xyz"):
                 candidates[end] = in_world(context, candidates, candidates[end])
@@ -155,6 +156,7 @@ def uniform(numbers: Array, ranges: tuple[Range, ...]) -> Array:
     """Scale uniform numbers of shape (m, n) to m ranges."""
     low = np.array([[r.low] for r in ranges])
     high = np.array([[r.high] for r in ranges])
+    # low + (high - low) u with u in [0, 1)
     scaled: Array = low + (high - low) * numbers
     return scaled
 
@@ -201,6 +203,7 @@ class GivenPositions(Stage):
                 f"a grid of {self.tasks:,} goals is too large, expected at most {MAX_TASKS:,}",
             )
             return
+        # One start holds for all goals.
         if len(self.start) not in {0, 1, self.tasks}:
             yield (
                 "start",
@@ -256,6 +259,7 @@ class GivenPositions(Stage):
             np.linspace(axis.low, axis.high, count)
             for axis, count in zip(self.grid, self.counts, strict=True)
         ]
+        # z changes fastest, then y, then x.
         return np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
 
     def _starts(self, context: Context) -> Array:

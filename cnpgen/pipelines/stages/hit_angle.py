@@ -56,7 +56,10 @@ class HitAngleToGoal(_HitAngle):
 
     def prepare(self, context: Context) -> StageFunction:
         def work(candidates: CandidateBatch, random: np.random.Generator) -> None:
+            # Directions of hits are angles on the table, which may be turned in the
+            # world.
             x, y = on_table(context, candidates, candidates["goal_xyz"])[:2]
+            # Uniform in [-noise, noise].
             noise = self.noise * (2 * candidates.draw(random, 1) - 1)
             candidates["hit_angle"] = wrap(
                 np.arctan2(self.target[1] - y, self.target[0] - x) + noise
@@ -126,6 +129,7 @@ class BehindPuck(Stage):
 
     def prepare(self, context: Context) -> StageFunction:
         contact = context.problem.first(PuckContact)
+        # The constraint places the puck from the goal; both distances must agree.
         if contact is not None and contact.contact_distance != self.distance:
             raise RecipeError(
                 [
@@ -147,5 +151,6 @@ def behind(puck: Array, angle: Array, distance: float) -> Array:
     The directions are angles about world z [rad], shape (1, N).
     """
     along = np.concatenate([np.cos(angle), np.sin(angle), np.zeros(angle.shape)])
+    # mallet = puck - distance * (cos(angle), sin(angle), 0)
     moved: Array = puck - distance * along[: len(puck)]
     return moved

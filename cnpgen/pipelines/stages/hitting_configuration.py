@@ -74,6 +74,7 @@ class HittingConfiguration(Stage):
 
         def work(candidates: CandidateBatch, _random: np.random.Generator) -> None:
             n = len(candidates.alive)
+            # Configuration to which the optimum stays close.
             home = (
                 np.repeat(robot.home[:, None], n, axis=1)
                 if self.near == "base"
@@ -136,6 +137,7 @@ class _Search:
 
         Return ``(q, last step, value)``.
         """
+        # The step of the last iteration shows whether it has converged.
         q, step = self._newton(
             self._first(start, position)[0], position, direction, home
         )

@@ -87,6 +87,8 @@ class HittingVelocity(Stage):
             candidates: CandidateBatch, random: np.random.Generator, _speed: Array
         ) -> Array:
             factor, choice = candidates.draw(random, 1), candidates.draw(random, 1)
+            # Both numbers are drawn for every candidate, so that the fraction does not
+            # change later ones.
             return np.where(choice < self.full_speed, 1.0, factor)
 
         return self._solve(context, draw_share)
@@ -149,7 +151,6 @@ class HittingVelocity(Stage):
             velocity, speed, found = kernel(candidates["goal_q"], *directions)
             limit = velocity_factor(context, candidates)
             if limit is not None:
-                # The solution is proportional to the limits.
                 # The optimum of the linear program scales with its bounds.
                 velocity, speed = velocity * limit, speed * limit
             factor = share(candidates, random, speed)
@@ -183,6 +184,7 @@ def hitting_velocity(robot: Robot, *, min_speed: float) -> Any:
         symbols("normal", 3),
     )
     jacobian = forward_kinematics(robot.chain, q).jacobian
+    # Speed along the hit: sum over joints of (d . J_i) dq_i.
     forward = [along(d, column) for column in jacobian]
     # Unit vectors across the hit: in the table's plane, and its normal.
     if robot.parameters.tilts_table:
@@ -269,6 +271,7 @@ def _smallest_ratio(b: list[Vec], limit: list[float], target: Vec) -> Vec:
     # Dual: maximize target . z / sum_k limit_k |b_k . z|; at the optimum z is
     # orthogonal to some b_j.
     for j in range(n):
+        # z orthogonal to b_j
         normal = [-b[j][1], b[j][0]]
         weight = sum(
             (limit[k] * ca.fabs(dot(b[k], normal)) for k in range(n) if k != j), 0.0

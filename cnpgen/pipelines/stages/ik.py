@@ -154,6 +154,7 @@ class GuessedIK(Stage):
             )
         # A stored problem was checked when it was made.
         for index, each in enumerate(() if context.problem.is_stored else self.guess):
+            # Both ends of one joint's range, all other joints at home.
             ends = np.full((2, n), robot.home)
             ends[:, index] = each.low, each.high
             if wrong := find_implausible_value(
@@ -168,6 +169,7 @@ class GuessedIK(Stage):
             candidates["guess_q"] = uniform(candidates.draw(random, n), guess)
             if self.at_limit:
                 choice, joint, side = candidates.draw(random, 3)
+                # One joint is chosen uniformly; rounding must not give the index n.
                 held = (
                     np.arange(n)[:, None] == np.minimum((joint * n).astype(int), n - 1)
                 ) & (choice < self.at_limit)

@@ -126,6 +126,7 @@ class SceneClearance:
         if self._prepared is not scenes:
             self._checker.prepare_scenes(scenes)
             self._prepared = scenes
+        # A missing constraint requires -inf, which every distance keeps.
         limits = self._obstacle_distance + margin, self._self_distance + self_margin
         return self._checker.clear_of_scenes(q, runs, limits)
 

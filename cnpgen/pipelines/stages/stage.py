@@ -149,6 +149,7 @@ class CandidateBatch:
             )
         self.columns[name] = values
         if len(self.alive) == self.size:
+            # Columns of all candidates, kept for statistics of rejected ones.
             self.drawn[name] = values
 
     def draw(self, random: np.random.Generator, width: int) -> Array:

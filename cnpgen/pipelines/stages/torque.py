@@ -44,6 +44,7 @@ class GravityTorque(Stage):
         kernel = context.kernels.load(torque_ratio)
 
         def work(candidates: CandidateBatch, _random: np.random.Generator) -> None:
+            # Parameters may change the payload.
             load = [candidates["parameters"]] if context.problem.parameters else []
             (ratio,) = kernel(candidates[f"{self.end}_q"], *load)
             candidates[f"{self.end}_torque_ratio"] = ratio

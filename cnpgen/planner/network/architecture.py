@@ -35,6 +35,7 @@ class Layer:
     @property
     def stop(self) -> int:
         """Offset of the next layer."""
+        # The bias follows the weights as one more row.
         return self.start + (self.inputs + 1) * self.outputs
 
     def weight(self, parameters: AnyArray) -> AnyArray:
@@ -166,6 +167,7 @@ def forward(weights: Weights, features: AnyArray) -> Activations:
     for layer in trunk_weights:
         trunk.append(_tanh_layer(layer, trunk[-1]))
     hidden = _tanh_layer(hidden_weights, trunk[-1])
+    # The time head has no tanh: logarithms of rates are unbounded.
     log_rate = trunk[-1] @ rate_weight
     log_rate += rate_bias
     return Activations(

@@ -105,6 +105,7 @@ def published_features(
         "dq": velocity_limit,
         "ddq": acceleration_limit,
     }
+    # "start_dq" has the unit of "dq".
     scale = np.concatenate([1 / units[name.partition("_")[2]] for name in blocks])
     return Features(blocks, np.zeros_like(scale), scale)
 
@@ -308,6 +309,7 @@ def make_scene_features(
         for capsule in robot.shape.moving_capsules
         for _ in _shares(capsule)
     ]
+    # Interior phases: the ends are features of their own.
     phases = (np.arange(PATH_PHASES) + 1) / (PATH_PHASES + 1)
     path = basis(phases, spec.path_control_points, spec.degree)
     return SceneFeatures(

@@ -69,6 +69,8 @@ class TipAxis(Constraint):
 
     def judged(self, world: "World") -> tuple[Condition, ...]:
         """Evaluate the angle between axis and direction [rad]."""
+        # Without parameters the tilt is in rad: the verdict limits the angle, not its
+        # multiple.
         tilt, upright = self._held(self._measured_axis(world), {})
         # atan2(|sine|, cosine): accurate at all angles, unlike the arccosine near 1.
         angle = np.arctan2(np.hypot(*tilt.g), upright.g[0])
@@ -93,6 +95,7 @@ class TipAxis(Constraint):
         return np.asarray(super().allowed(condition) / np.sqrt(len(condition.g)))
 
     def _symbolic_axis(self, state: "SymbolicState") -> list[Any]:
+        # R a, the axis in the world, along axes that turn with the direction.
         axis, _ = self.directions
         return state.along_upright(
             [along(axis, row) for row in state.kinematics.rotation]
@@ -110,11 +113,14 @@ class TipAxis(Constraint):
         self, pointing: Sequence[Any], parameters: Mapping[str, Any]
     ) -> tuple[Condition, ...]:
         """State the tilt of an axis, which is given along axes that turn with the direction."""
+        # e1 . R a and e2 . R a: sines of the tilt.
         tilt = [along(row, pointing) for row in self.across]
         if (tolerance := parameters.get(UPRIGHT_TOLERANCE)) is not None:
             # In units of the nominal tolerance: a sample with half of it has twice the
             # values.
             tilt = [value * (self.tolerance / tolerance) for value in tilt]
+        # d . R a > 0 excludes the axis that points the opposite way, where both sines
+        # are zero, too.
         upright = [along(self.directions[1], pointing)]
         return (
             Condition(
@@ -166,6 +172,7 @@ class Axis(TipAxis):
     @property
     def nominal_tolerance(self) -> float:
         """Value of the parameter ``upright_tolerance`` of samples without it [rad]."""
+        # A cone is limited by its angle, an aligned axis by its tolerance.
         return self.angle or self.tolerance
 
     def allowed(self, condition: Condition) -> Array:
@@ -194,6 +201,7 @@ class Axis(TipAxis):
 
     def symbolic_at(self, state: "SymbolicState", end: End) -> tuple[Condition, ...]:
         """State the tilt and, for an aligned axis, its rates."""
+        # The axis may move within its cone at the ends, so that its rates are free.
         if self.angle:
             return self.symbolic(state)
         turning = map(
@@ -223,6 +231,8 @@ class Axis(TipAxis):
     ) -> tuple[Condition, ...]:
         if not self.angle:
             return super()._held(pointing, parameters)
+        # d . R a >= cos(angle): the cosine is linear in R, the angle is not smooth at
+        # zero.
         cosine, least = along(self.directions[1], pointing), np.cos(self.angle)
         if (angle := parameters.get(UPRIGHT_TOLERANCE)) is not None:
             # Affine in the cosine, so that bound and accepted violation map to those of
@@ -301,6 +311,8 @@ def _cosine(angle: Any) -> Any:
     import casadi as ca
 
     return (
+        # Beyond a half turn the cosine would rise again, and a larger angle would be
+        # stricter.
         np.cos(min(angle, np.pi))
         if isinstance(angle, float)
         else ca.cos(ca.fmin(angle, np.pi))

@@ -99,6 +99,8 @@ class RobotClearance(DistanceConstraint):
 
         With the paper's capsules all of it.
         """
+        # A distance may be missed by all of the tolerance, as long as the bodies
+        # overlap by at most 0.1 mm.
         limit = (
             np.inf
             if self.radius is not None
@@ -135,6 +137,8 @@ class RobotClearance(DistanceConstraint):
         """Measure the signed distances with Coal [m]."""
         shape = world.robot.shape
         if shape is None:
+            # Capsules of the paper: Coal measures the axes, and the bound contains the
+            # radius.
             radius = self.radius or 0.0
             (found,) = self._clear(
                 world.segment_distances(radius + self.distance), [radius]
@@ -168,6 +172,7 @@ class RobotClearance(DistanceConstraint):
     def solved(self, world: "World") -> tuple[Condition, ...]:
         """Return the conditions of the capsules."""
         shape, capsule_axes = world.robot.shape, world.robot.capsule_axes
+        # Solvers and judges use the same shapes here: capsules and upright obstacles.
         if shape is None and not _has_poses(world.obstacles):
             return self.measured(world)
         capsules = (
@@ -175,6 +180,7 @@ class RobotClearance(DistanceConstraint):
             if shape is None
             else [c.radius for c in shape.moving_capsules]
         )
+        # Solvers read the bounds only: the zeros are placeholders.
         return self._clear(
             [0.0] * (len(capsules) * len(world.obstacles)), capsules, sufficient=True
         )
@@ -231,6 +237,8 @@ class ObjectContact(DistanceConstraint):
 
     def measured(self, world: "World") -> tuple[Condition, ...]:
         """Measure the signed distances with Coal [m]."""
+        # Legal contacts have distances down to -depth, so the search for the distance
+        # stops there.
         return self._at_least(world.object_distances(-self.depth), -self.depth)
 
     def solved(self, world: "World") -> tuple[Condition, ...]:

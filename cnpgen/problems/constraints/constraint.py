@@ -22,6 +22,8 @@ End = Literal["start", "goal"]
 MIN_TOLERANCE = 1e-9  # replaces a tolerance of zero in solvers and planners
 
 # Tolerances of conditions on boundary states, by stored float type: relative for limits, otherwise in SI units.
+# Positions stored as float32 have a relative rounding error of 6e-8, so that their
+# conditions hold less exactly.
 BOUNDARY_TOLERANCES: dict[str, dict[str, float]] = {
     "float64": {
         "limit": 1e-12,
@@ -84,6 +86,8 @@ class Condition:
 
     def tolerance(self, dtype: str) -> Array:
         """Return the tolerance of g on a boundary state stored as ``dtype``, in the unit of g, shape (m,)."""
+        # Limits have relative tolerances, at least those of a limit of 1; infinite
+        # bounds have no size.
         exact = BOUNDARY_TOLERANCES[dtype][self.tolerance_kind]
         if self.tolerance_kind != "limit":
             return np.full(len(self.g), exact)
@@ -96,6 +100,7 @@ class Condition:
     def violation(self) -> float:
         """Return the maximum of ``max(lower - g, g - upper, 0)`` of a measured condition; nan counts as infinite."""
         g = np.array(self.g, float)
+        # The maximum of values with nan is nan.
         worst = float(np.max(np.maximum(self.lower - g, g - self.upper), initial=0.0))
         return worst if np.isfinite(worst) else np.inf
 

@@ -56,6 +56,7 @@ class _RelativeLimit(Constraint):
         self, state: "SymbolicState | World", factor: Any
     ) -> tuple[Condition, ...]:
         """Divide rates by the factor of their limits, so that the bounds are the same for all samples."""
+        # Boundary states have no jerk.
         if (rates := getattr(state, self.rates)) is None:
             return ()
         # A limit times a factor is the same as a rate divided by it.
@@ -149,6 +150,8 @@ class JointTorque(_RelativeLimit):
         drive = state.robot.drive
         if drive is None:
             return super()._within(state, factor)
+        # drive.limits chooses the side of the gear: the rigid torque at the joint, that
+        # of the motor, or both.
         joint = super()._within(state, factor) if drive.limits_joint else ()
         moving = MotorTorques(state.dq, state.motor_torque)
         return (*joint, *motor_conditions(state.robot, drive, moving))
@@ -171,6 +174,7 @@ def motor_conditions(
         "highest": (high, drive.motor_rows),
         "lowest": (low, drive.uncertain_rows),
     }
+    # The limit of the torque is a line of slope zero.
     flat = SpeedLine(drive.torque_limit, np.zeros(robot.n), motoring=True)
     for number, line in enumerate((flat, *drive.lines)):
         for end, (torque, joints) in ends.items():
@@ -189,6 +193,8 @@ def _line_condition(
     rows = joints * len(line.signs)
     signs = np.repeat(line.signs, len(joints)).tolist()
     unit = units_of_joints("N m", tuple(robot.prismatic[joint] for joint in rows))
+    # A line without slope omits the velocity, so that kernels have no product with
+    # zero.
     g = [
         torque[joint] + sign * slope * dq[joint]
         if (slope := float(line.slope[joint]))
@@ -213,6 +219,7 @@ def _power_condition(
     rows = [*drive.motor_rows, *drive.uncertain_rows]
     g = [high[joint] * dq[joint] for joint in drive.motor_rows]
     g += [low[joint] * dq[joint] for joint in drive.uncertain_rows]
+    # |tau dq| <= tau_max dq_max, so that twice this bound is never reached.
     lowest = -2 * (np.maximum(drive.torque_limit * robot.velocity_limit, power))[rows]
     parts = tuple(robot.joint_names[joint] for joint in rows)
     return Condition("motor power", POWER_UNIT, g, lowest, power[rows], "limit", parts)
@@ -260,6 +267,7 @@ class TipSpeed(Constraint):
                 "tip speed",
                 "m^2/s^2",
                 [square],
+                # A square is never below zero.
                 np.array([-np.inf]),
                 np.array([self.limit**2]),
                 "velocity",

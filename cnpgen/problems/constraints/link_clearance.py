@@ -81,6 +81,7 @@ class SelfClearance(LinkClearance):
 
     def solved(self, world: "World") -> tuple[Condition, ...]:
         """Return the conditions of the capsules."""
+        # Solvers read the bounds only: the distances are placeholders.
         radii = _radii(world.robot, _for_solvers(world.robot))
         return self._at_least(
             [0.0] * len(radii), radii + self.distance, sufficient=True
@@ -88,6 +89,8 @@ class SelfClearance(LinkClearance):
 
     def symbolic_at(self, state: "SymbolicState", end: End) -> tuple[Condition, ...]:  # noqa: ARG002
         """State the distances of all pairs."""
+        # Boundary states are checked for all pairs, since a conservative condition
+        # rejects none by itself.
         return self._capsule_distances(state, _looked_at(state.robot))
 
     def _capsule_distances(
@@ -126,6 +129,7 @@ def _radii(robot: "Robot", pairs: "Sequence[LinkPair]") -> Array:
         if robot.shape
         else {}
     )
+    # Two capsules touch where their axes are the sum of the radii apart.
     return np.array([radius[pair.first] + radius[pair.second] for pair in pairs], float)
 
 

@@ -82,6 +82,7 @@ class Plane(TipManifold):
         """Return the normal and both directions in the plane, unit vectors."""
         normal = unit(self.normal, "normal")
         if self.along is None:
+            # Without ranges any two directions in the plane serve.
             return normal, beside(normal)
         given = unit(self.along, "along")
         # The direction is projected into the plane, so that both axes are orthogonal.
@@ -127,6 +128,7 @@ class Line(TipManifold):
     def place(self) -> TipRegion:
         """Region of the tip: the line."""
         direction = unit(self.direction, "direction")
+        # A line without a piece is unbounded.
         bounded, ranges = (
             ([direction.tolist()], (self.piece,)) if self.piece else ((), ())
         )

@@ -71,6 +71,7 @@ class Pose(TipManifold):
             np.array([[cp, 0, sp], [0, 1, 0], [-sp, 0, cp]]),
             np.array([[cy, -sy, 0], [sy, cy, 0], [0, 0, 1]]),
         )
+        # URDF convention, fixed axes: R = Rz(yaw) Ry(pitch) Rx(roll).
         return np.asarray(yaw @ pitch @ roll)
 
     def symbolic(self, state: "SymbolicState") -> tuple[Condition, ...]:
@@ -95,6 +96,7 @@ class Pose(TipManifold):
         """Return the tolerance of an offset, of the angle, or of each component of the angle."""
         allowed = super().allowed(condition)
         return (
+            # Three equal components of size a / sqrt(3) have the norm a.
             allowed / np.sqrt(len(condition.g))
             if condition.name == "orientation"
             else allowed
@@ -158,6 +160,7 @@ class Pose(TipManifold):
             Condition(
                 "less than a quarter turn",
                 "1",
+                # The sine is zero at half a turn, too; a positive cosine excludes it.
                 [cosine],
                 np.zeros(1),
                 np.full(1, np.inf),

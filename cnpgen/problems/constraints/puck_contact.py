@@ -137,6 +137,7 @@ class PuckContact(Constraint):
 
         The goal is in contact.
         """
+        # At the goal the bodies overlap by construction.
         if end == "goal":
             return ()
         return _at_least(
@@ -173,6 +174,7 @@ class PuckContact(Constraint):
         """
         x, y = world.parameters.on_table(world.tip_position)[:2]
         values = world.scene_values
+        # Without values there is no puck.
         if not len(values):
             return np.full(np.shape(x), PUCK_OUT_OF_REACH_M)
         goal, puck = np.asarray(values[:2]), np.asarray(values[2:4])
@@ -215,6 +217,8 @@ class PuckContact(Constraint):
         for the overlap h and the length l, permits contact in the disc of diameter l.
         The maximum is rounded, so that the verdict finds local maxima.
         """
+        # At the goal the distance is the range less the overlap, so that the sum below
+        # equals the bound.
         overlap = self.overlap + ADDED_RADIUS_M
         relaxation = overlap * _positive_part(1 - from_goal / (overlap * self.last))
         return _at_least(self.contact_range + ADDED_RADIUS_M, distance + relaxation)
@@ -228,6 +232,8 @@ class PuckContact(Constraint):
         straight hit has the same margin at all of them. Solvers, which check grid
         points only, would miss the first contact.
         """
+        # The relaxation h max(1 + (m - rho) / h, 0) is h + m at the goal and falls with
+        # slope one.
         overlap = self.overlap + ADDED_RADIUS_M + margin
         rho = (from_goal + MIN_SQUARED_PUCK_DISTANCE_M2) ** 0.5
         relaxation = overlap * _positive_part(
@@ -251,6 +257,7 @@ class PuckContact(Constraint):
             return []
         radius = self.contact_range + GUESS_CLEARANCE_M
         offset = start - puck
+        # Within the circle there is no tangent: acos(radius / distance) is then zero.
         distance = max(float(np.hypot(*offset)), radius)
         # 0 behind the puck
         angle = math.atan2(
@@ -282,6 +289,7 @@ class PuckContact(Constraint):
 
 def _positive_part(value: Any) -> Any:
     """Return ``max(value, 0)``, rounded."""
+    # (x + sqrt(x^2 + r^2)) / 2: it exceeds max(x, 0) by at most r / 2.
     return (value + (value * value + ROUNDING**2) ** 0.5) / 2
 
 
@@ -301,6 +309,8 @@ def _at_least(bound: float, distance: Any) -> tuple[Condition, ...]:
 def distances_from_segments(point: Array, first: Array, second: Array) -> Array:
     """Return the distances of points from segments between two ends [m], for arrays of shape (..., 2)."""
     along = second - first
+    # Nearest point at the share t = (p - a) . d / |d|^2, clipped to the segment; a
+    # segment may be a point.
     length = np.maximum(np.sum(along**2, axis=-1), 1e-12)
     share = np.clip(np.sum((point - first) * along, axis=-1) / length, 0.0, 1.0)
     return np.asarray(np.linalg.norm(point - first - share[..., None] * along, axis=-1))

@@ -79,8 +79,11 @@ class Table(TipManifold):
     def judged(self, world: "World") -> tuple[Condition, ...]:
         """Evaluate the tip position with the rectangle of the sample."""
         conditions, values = self.measured(world), world.parameters.values
+        # The rectangle is that of the problem file.
         if values.keys().isdisjoint(TABLE_BOUNDS):
             return conditions
+        # The verdict compares the tip itself with the rectangle of the sample, so that
+        # messages have coordinates.
         inside, height = conditions
         low, high = (np.array(corner, float) for corner in self.bounds_of(values))
         tip = self._measured_tip(world)[:2]
@@ -100,6 +103,7 @@ class Table(TipManifold):
             parameters.get(name, bound) - bound for name, bound in self.bounds.items()
         ]
         g = [value - shift for value, shift in zip(sides, shifts, strict=True)]
+        # Each value has one finite bound, that of its side.
         lower = np.array([self.x.low, -np.inf, self.y.low, -np.inf])
         upper = np.array([np.inf, self.x.high, np.inf, self.y.high])
         return replace(

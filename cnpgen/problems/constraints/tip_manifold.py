@@ -57,6 +57,7 @@ class TipRegion:
             np.array([getattr(each, end) for each in self.ranges])
             for end in ("low", "high")
         )
+        # Ranges are relative to the point; bounds have the coordinates of the world.
         return origin + low, origin + high
 
 
@@ -131,6 +132,7 @@ class TipManifold(Constraint):
         self, condition: Condition, s: Array, start_tip: Array
     ) -> Array:
         """Relax the bounds for a start off the manifold: by ``start_off`` until s = 0.1, by zero from s = 0.3 on."""
+        # Ranges and rates hold from the start on.
         if condition.name != self.held_name:
             return super().bound_relaxation(condition, s, start_tip)
         # Linear between both kinks.
@@ -159,6 +161,8 @@ class TipManifold(Constraint):
         if place.ranges:
             found.append(self._inside(tip, parameters))
         if place.held:
+            # row . p - height is the distance from the manifold along a fixed
+            # direction.
             low, high = place.height - band, place.height + band
             g = [along(row, tip) for row in place.held]
             found.append(
@@ -181,6 +185,7 @@ class TipManifold(Constraint):
     ) -> tuple[Condition, ...]:
         """State that the tip moves along the manifold only."""
         held, parts = self.place.held, self.parts[1]
+        # A region without fixed directions leaves the velocity free.
         if not held:
             return ()
         zero = np.zeros(len(held))
@@ -223,6 +228,7 @@ def unit(vector: Sequence[float] | Array, what: str) -> Array:
     length = np.linalg.norm(given)
     if not (np.isfinite(length) and length > 1e-9):
         raise ValueError(f"{what} must be a direction, which {tuple(vector)} is not")
+    # A vector of length 1 keeps its digits.
     return np.asarray(given if length == 1 else given / length)
 
 

@@ -84,6 +84,7 @@ def scene_bodies(scenes: Scenes) -> Primitives:
         raise UsageError("there are no scenes", concerns="scenes")
     if isinstance(scenes, Scene):
         return scene_primitives(scenes)
+    # Poses in several frames have no common origin without the kinematics of the robot.
     for scene in scenes:
         if (
             isinstance(scene, SceneProblem)

@@ -59,6 +59,8 @@ def placed_scene(scene: SceneProblem, robot: Robot, start: Array) -> SceneProble
         frame, what = request.frame_of(index), f"obstacle {each.name!r}"
         pose = frames.pose(frame, what)
         obstacle = moved_obstacle(each, pose) if frame else each
+        # An obstacle that links may touch becomes a fixed body of the robot, whose
+        # pairs can be left out.
         if links := _moving(names, request, frames, f"an allowed collision of {what}"):
             item = AttachedObject(each.name, "", (obstacle,), ("",), links)
             touchable.append(item)
@@ -77,6 +79,7 @@ def placed_scene(scene: SceneProblem, robot: Robot, start: Array) -> SceneProble
         frames.check_link(link, "a padding or scale")
     carried = tuple(_in_link(each, request, frames) for each in request.attached)
     constraints = tuple(_in_world(request, frames))
+    # All poses are placed now: a second placement changes nothing.
     plain: SceneRequest = replace(
         request,
         obstacle_frames=(),
@@ -105,6 +108,7 @@ def _moved_goal(goal: GoalPose, frame: str, frames: LinkFrames) -> GoalPose:
     position, rotation = frames.pose(frame, "the goal pose")
     return replace(
         goal,
+        # p' = p_frame + R_frame p, R' = R_frame R
         position=position + rotation @ goal.position,
         rotation=rotation @ goal.rotation,
     )
@@ -119,10 +123,12 @@ class LinkFrames:
         self._scene, self._model = scene, robot.model
         tree = urdf_tree(robot.urdf_text)
         self.links = tuple(link.get("name", "") for link in tree.findall("link"))
+        # Links are placed at the start state.
         self._data = self._model.createData()
         pin.framesForwardKinematics(self._model, self._data, start)
         children = {child.get("link") for child in tree.iter("child")}
         for frame, is_base in scene.request.fixed_frames:
+            # Only the root link has a constant pose in the base frame, the identity.
             if frame in self.links and (not is_base or frame in children):
                 raise SceneError(
                     f"{scene.place}: its frame {frame!r} is a link of the robot, which"
@@ -144,6 +150,7 @@ class LinkFrames:
 
     def moves(self, link: str) -> bool:
         """Return whether planned joints move a link."""
+        # Joint 0 of Pinocchio is the universe, which does not move.
         return bool(self._model.frames[frame_of(self._model, link)].parentJoint)
 
     def check_moves(self, link: str, what: str, *, moves: bool) -> None:
@@ -171,8 +178,10 @@ def moved_obstacle(obstacle: Obstacle, pose: Pose) -> Obstacle:
     if not position.any() and np.array_equal(rotation, np.eye(3)):
         # Its numbers stay exact.
         return obstacle
+    # p' = p_frame + R_frame p
     x, y, z = (position + rotation @ np.array(obstacle.position)).tolist()
     if obstacle.kind == "sphere":
+        # A sphere has no rotation.
         return replace(obstacle, position=(x, y, z))
     turn = roll_pitch_yaw(rotation @ turned(*obstacle.rotation))
     return replace(obstacle, position=(x, y, z), rotation=turn)
@@ -215,6 +224,7 @@ def _in_link(
             shapes.append(shape)
             continue
         origin, turn = frames.pose(frame, what)
+        # R_link^T (p_frame - p_link) and R_link^T R_frame
         back = rotation.T @ (origin - position), rotation.T @ turn
         shapes.append(moved_obstacle(shape, back))
     return replace(item, shapes=tuple(shapes), frames=(item.link,) * len(item.shapes))

@@ -75,12 +75,15 @@ def obstacles_of_points(
         "m",
     )
     least = integer("max_obstacles", max_obstacles, least=1)
+    # The grid of extent / edge voxels per axis has at most MAX_GRID_VOXELS: edge^3 >=
+    # volume / maximum.
     edge = max(
         resolution,
         float(
             (np.prod(np.ptp(cloud, axis=0) + resolution) / MAX_GRID_VOXELS) ** (1 / 3)
         ),
     )
+    # The number of boxes is only known once they are built.
     boxes = _boxes(cloud, edge)
     while len(boxes) > least:
         edge *= VOXEL_GROWTH
@@ -93,6 +96,7 @@ def obstacles_of_points(
 
 def _obstacle(name: str, low: Array, high: Array, radius: float) -> Obstacle:
     x, y, z = ((low + high) / 2).tolist()
+    # The box of the centers grows by the radius to all sides.
     a, b, c = (high - low + 2 * radius).tolist()
     return Obstacle(name=name, position=(x, y, z), size=(a, b, c))
 
@@ -102,15 +106,18 @@ def _boxes(points: Array, edge: float) -> list[tuple[Array, Array]]:
     voxels = ((points - points.min(axis=0)) / edge).astype(np.int64)
     occupied = np.zeros(voxels.max(axis=0) + 1, bool)
     occupied[tuple(voxels.T)] = True
+    # Box of each voxel, from which the box of each point follows.
     owner = np.full(occupied.shape, -1)
     count = 0
     for voxel in np.argwhere(occupied):
+        # Voxels of an earlier block are no longer occupied.
         if occupied[tuple(voxel)]:
             block = _grown(occupied, voxel)
             owner[block], occupied[block] = count, False
             count += 1
     index = owner[tuple(voxels.T)]
     low, high = np.full((count, 3), np.inf), np.full((count, 3), -np.inf)
+    # Boxes shrink from the voxels to the points in them.
     np.minimum.at(low, index, points)
     np.maximum.at(high, index, points)
     return list(zip(low, high, strict=True))
@@ -119,10 +126,12 @@ def _boxes(points: Array, edge: float) -> list[tuple[Array, Array]]:
 def _grown(occupied: NDArray[np.bool_], voxel: Voxels) -> tuple[slice, ...]:
     """Return the largest block of occupied voxels that begins at a voxel, grown along one axis after the other."""
     stop = voxel + 1
+    # The longest axis of the grid first.
     for axis in np.argsort(occupied.shape)[::-1]:
         while stop[axis] < occupied.shape[axis]:
             layer = [slice(begin, end) for begin, end in zip(voxel, stop, strict=True)]
             layer[axis] = slice(stop[axis], stop[axis] + 1)
+            # A block contains occupied voxels only, so that free space stays free.
             if not occupied[tuple(layer)].all():
                 break
             stop[axis] += 1

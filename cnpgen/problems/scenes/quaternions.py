@@ -31,6 +31,8 @@ def quaternion_of(rotation: Array) -> Array:
     2000).
     """
     (a, b, c), (d, e, f), (g, h, i) = rotation
+    # K = 3 times Bar-Itzhack's matrix: for a rotation its largest eigenvalue is 3, with
+    # the eigenvector (w, x, y, z).
     symmetric = np.array(
         [
             [a + e + i, h - f, c - g, d - b],
@@ -40,11 +42,14 @@ def quaternion_of(rotation: Array) -> Array:
         ]
     )
     wxyz: Array = np.linalg.eigh(symmetric)[1][:, -1]
+    # q and -q are the same rotation.
     return wxyz if wxyz[0] >= 0 else -wxyz
 
 
 def roll_pitch_yaw(rotation: Array) -> tuple[float, float, float]:
     """Return roll, pitch and yaw about fixed axes [rad] of a rotation matrix, as ``<origin rpy>`` of a URDF."""
+    # R = Rz(yaw) Ry(pitch) Rx(roll): R_20 = -sin(pitch), and (R_00, R_10) has the
+    # length |cos(pitch)|.
     sine, cosine = -rotation[2, 0], math.hypot(rotation[0, 0], rotation[1, 0])
     if cosine < 1e-9:
         # Pitch of 90 degrees: roll and yaw turn about the same axis.

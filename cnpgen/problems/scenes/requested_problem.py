@@ -69,6 +69,7 @@ def requested_problem(
             payload,
         )
     _report_held_joints(problem, scenes)
+    # Plans of one call share limits, links and constraints, hence one problem.
     for scene in scenes:
         if scene.request.changes != first.request.changes:
             raise SceneError(
@@ -77,6 +78,7 @@ def requested_problem(
                 " scenes of one problem by {first} and {n}",
                 remedies={"first": None, "n": None},
             )
+    # The problem keeps its identity, and with it its kernels.
     if not first.request.changes_problem:
         return problem, robot, list(scenes)
     constraints = *problem.constraint, *first.request.constraints
@@ -99,6 +101,7 @@ def _report_held_joints(problem: Problem, scenes: Sequence[SceneProblem]) -> Non
         for each in tree.iter("joint")
         if each.get("type") != "fixed"
     }
+    # Joints that are neither planned nor locked stay at zero.
     held = dict.fromkeys(moving - set(spec.joints), 0.0)
     held |= zip(spec.locked_joints, spec.locked_positions, strict=True)
     known = {each.get("name", "") for each in tree.iter("joint")}
@@ -135,6 +138,8 @@ def _without_changes(scene: SceneProblem) -> SceneProblem:
 def _with_scales(problem: Problem, robot: Robot, scene: SceneProblem) -> Problem:
     """Return the problem with scaled limits of velocities and accelerations; those of jerks and torques stay."""
     request = scene.request
+    # Default limits of accelerations and jerks follow from those of velocities: stated
+    # as numbers, they do not scale with these.
     limits = replace(
         problem.limits,
         velocity_scale=problem.limits.velocity_scale * request.velocity_scale,
@@ -150,6 +155,7 @@ def _with_mass(
     item: AttachedObject, problem: Problem, scene: SceneProblem, payload: float | None
 ) -> AttachedObject:
     """Return an attached object with a mass; an unknown one is refused for problems with torques."""
+    # An object of the world is no load.
     if not item.link:
         return item
     if item.mass:
@@ -181,6 +187,7 @@ def _with_objects(
             f"{scene.place} has attached objects or sizes of links, and the problem {problem.name!r} has"
             ' no link geometry: expected [robot] geometry = "urdf"'
         )
+    # Objects of the world become links here, so that self-clearance applies to them.
     if not all(item.link for item in objects):
         _check_clearances(problem, scene)
     record, names = record_problem(problem), {item.name for item in objects}
@@ -193,6 +200,8 @@ def _with_objects(
                 item.link or root,
                 shapes=item.shapes,
                 mass=item.mass,
+                # Contacts with other attached objects are added once all objects are
+                # links.
                 touch_links=[link for link in item.touch_links if link not in names],
             )
         touching = [
@@ -214,6 +223,7 @@ def _with_sizes(
     """Return a URDF with larger copies of links, and of what they carry, that obstacles must not enter."""
     fixed = [item for item in objects if not item.link]
     for link, scale, padding in scene.request.link_sizes:
+        # An attached object grows with its link.
         bodies = {link: link}
         bodies |= {
             item.name: attached_link_name(item.name)
@@ -224,6 +234,7 @@ def _with_sizes(
             obstacles = [
                 attached_link_name(item.name)
                 for item in fixed
+                # A body may touch these objects at any size.
                 if name not in item.touch_links
             ]
             urdf = with_padded_link(urdf, body, scale, padding, obstacles=obstacles)
@@ -247,6 +258,7 @@ def _check_contacts(robot: Robot, scene: SceneProblem) -> None:
     }
     for pair in () if robot.shape is None else robot.shape.pairs:
         body = next((each for each in (pair.first, pair.second) if each in names), None)
+        # Pairs that overlap in every state are left out of all checks.
         if body is None or pair.left_out != "always":
             continue
         other = pair.second if body == pair.first else pair.first

@@ -234,6 +234,7 @@ def make_mesh(
             raise UsageError(
                 f"must have shape {shape}, got {values.shape}", argument=argument
             )
+    # False for nan, too.
     if not (np.abs([*vertices.ravel(), *origin]) <= MAX_COORDINATE_M).all():
         raise SceneError(
             f"{where}: points and position must be finite and at most {MAX_COORDINATE_M:g}",
@@ -244,6 +245,7 @@ def make_mesh(
             f"{where}: its rotation is no rotation matrix: {turn.tolist()}"
         )
     try:
+        # Only the convex hull counts; a flat one has no interior and no depth.
         corners = hull_corners(vertices)
         check_solid(corners)
     except ValueError as error:
@@ -260,6 +262,7 @@ def make_mesh(
 
 def is_rotation(matrix: Array) -> bool:
     """Return whether a matrix of shape (3, 3) is a rotation up to rounding."""
+    # R R^T = 1 and det R = 1; det R = -1 is a reflection.
     error = np.abs(matrix @ matrix.T - np.eye(3)).max()
     return bool(error <= MAX_ROTATION_ERROR and np.linalg.det(matrix) > 0)
 
@@ -346,9 +349,11 @@ def checked_scene(scene: SceneProblem) -> SceneProblem:
     counts = len(scene.start_q), len(scene.goal_q), len(scene.obstacles)
     if error := next(scene.request.errors(*counts), ""):
         raise SceneError(f"{scene.place}: {error}")
+    # Messages and verdicts name obstacles.
     scene = replace(scene, obstacles=_uniquely_named(scene.obstacles))
     depths = np.array(
         [
+            # Poses in frames of links are not known yet.
             -np.inf if scene.request.frame_of(index) else _depth_of_base(obstacle)
             for index, obstacle in enumerate(scene.obstacles)
         ]
@@ -367,6 +372,7 @@ def _depth_of_base(obstacle: Obstacle) -> float:
 
     Negative outside.
     """
+    # The depth is the negative signed distance of the origin.
     bodies = primitives_of([obstacle], place_obstacles([obstacle]))
     return -float(signed_distances(bodies, np.zeros((1, 3)))[0, 0])
 

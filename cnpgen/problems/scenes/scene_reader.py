@@ -75,6 +75,7 @@ def read_scenes(
     readers = _readers()
     if not readers:
         raise addons.missing("scene_files", f"reading scenes from {path}")
+    # A reader raises the error for a path that none accepts.
     chosen = next((reader for reader in readers if reader.holds(path)), readers[0])
     return chosen.load(path, start=start, n=n, options=options)
 

@@ -43,6 +43,7 @@ class AttachedObject:
     @property
     def digest(self) -> tuple[object, ...]:
         """Everything that makes two attached objects equal."""
+        # The order of links in a file does not matter.
         links = tuple(sorted(set(self.touch_links)))
         return self.name, self.link, self.shapes, self.frames, links, self.mass
 
@@ -112,6 +113,7 @@ class SceneRequest:
         """Changes of the robot's problem: scaling factors, attached objects, sizes of links, and constraints."""
         objects = tuple(each.digest for each in self.attached)
         scales = self.velocity_scale, self.acceleration_scale
+        # Frames and goals do not change the problem, only its boundary problems.
         return *scales, objects, frozenset(self.link_sizes), self.constraints
 
     @property

@@ -41,6 +41,7 @@ def _documents(path: Path, yaml: Any, events: Any, numbers: bool) -> Iterator[An
     # Open mappings and lists, and the keys that wait for their values, each in a tuple.
     stack: list[Any] = []
     for event in events:
+        # Nested aliases expand exponentially.
         if getattr(event, "anchor", None) is not None:
             raise SceneError(
                 f"{path} has the anchor {event.anchor!r:.60}, expected a file without anchors"
@@ -55,6 +56,7 @@ def _documents(path: Path, yaml: Any, events: Any, numbers: bool) -> Iterator[An
         if isinstance(event, yaml.MappingEndEvent | yaml.SequenceEndEvent):
             value = stack.pop()
         elif isinstance(event, yaml.ScalarEvent):
+            # In a mapping without a waiting key, the next scalar is a key.
             is_key = bool(stack) and isinstance(stack[-1], dict)
             value = _scalar(event, numbers and not is_key)
         else:
@@ -65,6 +67,7 @@ def _documents(path: Path, yaml: Any, events: Any, numbers: bool) -> Iterator[An
 def _scalar(event: Any, numbers: bool) -> str | float | None:
     """Return the value of a scalar; quoted ones are texts."""
     text: str = event.value
+    # implicit[0] is true for plain scalars.
     if event.implicit[0]:
         if text in {"", "~", "null"}:
             return None
@@ -81,6 +84,7 @@ def _put(stack: list[Any], value: Any) -> Iterator[Any]:
     elif isinstance(stack[-1], list):
         stack[-1].append(value)
     elif isinstance(stack[-1], dict):
+        # The key waits for its value, on top of its mapping.
         stack.append((value if isinstance(value, str) else repr(value),))
     else:
         (key,) = stack.pop()

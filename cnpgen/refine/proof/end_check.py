@@ -71,6 +71,7 @@ class EndCheck:
             "goal": (boundary.goal_q[0], boundary.goal_dq[0], goal_ddq),
         }
         world.set_state(*ends["start"], obstacle_poses)
+        # Relaxations of bounds depend on the start of the motion, at both ends.
         start_tip = world.tip_position
         for end, state in ends.items():
             world.set_state(*state, obstacle_poses)
@@ -118,6 +119,7 @@ def _violation(
     )
     violation = np.maximum(condition.lower - g, g - condition.upper) - relaxation
     tolerance = constraint.allowed(condition)
+    # One value is named: the one furthest beyond its tolerance.
     worst = int(np.argmax(violation - tolerance))
     if violation[worst] > tolerance[worst] + margin * max(1.0, abs(bound[worst])):
         unit = "" if condition.unit == "1" else f" {unit_of(condition.unit, worst)}"
@@ -136,12 +138,15 @@ def _has_acceleration(problem: Problem, world: World, torque: JointTorque) -> bo
     robot, q, dq = world.robot, world.q, world.dq
     acceleration = joint_limits(problem, robot, tolerances=1.0).acceleration
     model, data = world.parameters.model, world.parameters.model.createData()
+    # tau(ddq) = M ddq + bias: columns of the inertia matrix M are tau(unit) - bias.
     bias = np.array(pin.rnea(model, data, q, dq, np.zeros(robot.n)))
     inertia = np.array(
         [pin.rnea(model, data, q, dq, unit) - bias for unit in np.eye(robot.n)]
     ).T
     inertia, bias, limit = _limited_torques(robot, inertia, bias, dq)
     limit = limit * (1 + torque.tolerance + BOUNDARY_MARGIN[2]) + BOUNDARY_MARGIN[2]
+    # Feasibility of |M ddq + bias| <= limit with |ddq| <= ddq_max, a linear program
+    # without an objective.
     solved = linprog(
         np.zeros(robot.n),
         A_ub=np.vstack([inertia, -inertia]),
@@ -164,6 +169,7 @@ def _limited_torques(
     if drive is None:
         return inertia, bias, robot.torque_limit
     lowest, highest = friction_bounds(drive, dq)
+    # The motor also accelerates its rotor: tau + J ddq.
     with_rotors = inertia + np.diag(drive.armature)
     rows = (
         [(inertia, bias, robot.torque_limit)]

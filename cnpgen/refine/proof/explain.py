@@ -70,6 +70,7 @@ def explain_failure(
         )
     ends = EndCheck(problem, robot).violations(boundary, scene)
     violations = (text for _, text in ends)
+    # Cheap proofs first; the first one is enough.
     for text in chain(violations, _cannot_brake(problem, robot, boundary)):
         return Explanation(Feasibility.INFEASIBLE, text)
     unknown = Explanation(Feasibility.UNKNOWN, "there is no proof of infeasibility")
@@ -123,6 +124,7 @@ def _cannot_brake(problem: Problem, robot: Robot, boundary: Boundary) -> Iterato
     for end, state in end_states(boundary).items():
         for time in times:
             lower, upper = state.box(float(time), limits)
+            # An empty box: the joint cannot be within its range at this time.
             for joint in np.flatnonzero(lower > upper + POSITION_MARGIN_RAD):
                 instant, name = _time_text(end, float(time)), robot.joint_names[joint]
                 violation = float(lower[joint] - upper[joint]) - POSITION_MARGIN_RAD

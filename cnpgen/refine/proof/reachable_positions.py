@@ -66,6 +66,7 @@ class EndState:
         Empty where lower > upper.
         """
         upper = _max_position(self.q, self.dq, time, limits)
+        # The lowest position is the highest one of the mirrored joint.
         lower = -_max_position(-self.q, -self.dq, time, limits)
         return np.maximum(lower, limits.lower), np.minimum(upper, limits.upper)
 
@@ -74,6 +75,7 @@ def end_states(boundary: Boundary) -> dict[str, EndState]:
     """Return both end states of one motion."""
     return {
         "start": EndState(boundary.start_q[0], boundary.start_dq[0]),
+        # Reversed time changes the sign of velocities.
         "goal": EndState(boundary.goal_q[0], -boundary.goal_dq[0]),
     }
 
@@ -82,6 +84,7 @@ def sample_times(boundary: Boundary, limits: JointLimits) -> Array:
     """Return times from either end [s] that are shorter than any motion between the two ends."""
     start, goal = end_states(boundary).values()
     pairs = (start, goal), (goal, start)
+    # The first time at which each end is in the box of the other; no motion is shorter.
     min_steps = next(
         (
             k
@@ -105,6 +108,8 @@ def _reaches(state: EndState, q: Array, time: float, limits: JointLimits) -> boo
 
 def _max_position(q: Array, dq: Array, time: float, limits: JointLimits) -> Array:
     """Return the positions after full acceleration to the velocity limit, and constant velocity from there."""
+    # v(t) = min(dq + a t, v_max): q + dq t_r + a t_r^2 / 2 + v_max (t - t_r) with t_r =
+    # (v_max - dq) / a.
     ramp = np.clip((limits.velocity - dq) / limits.acceleration, 0.0, time)
     cruise = np.maximum(limits.velocity, dq) * (time - ramp)
     return np.asarray(q + dq * ramp + limits.acceleration * ramp**2 / 2 + cruise)

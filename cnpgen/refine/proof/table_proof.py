@@ -90,6 +90,7 @@ def table_bounds(
             margin - table.y.low,
         ]
         limits += [table.z + band, band - table.z]
+    # Rows: +x, -x, +y, -y, +z, -z.
     normals = np.repeat(np.eye(3), 2, axis=0) * np.tile([1.0, -1.0], 3)[:, None]
     height = np.tile(np.arange(6) >= 4, len(tables))
     return TableBounds(np.tile(normals, (len(tables), 1)), np.array(limits), height)
@@ -150,9 +151,12 @@ def find_table_exit(
             key=lambda item: item.value,
             default=None,
         )
+        # The drift is measured from the end itself, which may be near the edge.
         at_end = exact.violation(arm.at(state.q).position)
         if worst is None or worst.value < max(-VERGE_DISTANCE_M, at_end + MIN_DRIFT_M):
             continue
+        # A proof must hold for all that the verdict accepts, hence the relaxed bounds
+        # and limits.
         proof = _prove(arm, wide, _violations(arm, wide, state, relaxed, times))
         if proof is not None:
             return TableExit(end, *proof, proven=True)
@@ -185,10 +189,13 @@ def _prove(
         (item for item in violations if item.value > 0), key=lambda item: -item.value
     )
     for item in positive[:MAX_PROOFS]:
+        # Multipliers m >= 0 combine the bounds. If (normals^T m) . tip > limits . m for
+        # all reachable tips, not all bounds hold.
         direction, limit = (
             bounds.normals.T @ item.multipliers,
             float(bounds.limits @ item.multipliers),
         )
+        # A proof of most of the distance is tried first, then one of any violation.
         for fraction in (0.8, 0.0):
             bound = bound_projection(
                 arm, direction, *item.box, above=limit + fraction * item.value
@@ -228,6 +235,8 @@ def _search(
             break
         step, predicted, multipliers = solution
         new = bounds.violation(arm.at(q + step).position)
+        # A step is accepted if the violation decreases; otherwise the region of the
+        # linearization shrinks.
         if new < value:
             gain, q, value = value - new, q + step, new
             if gain < MIN_GAIN_M:
@@ -246,6 +255,8 @@ def _linear_step(
     from scipy.optimize import linprog
 
     tip, n = arm.at(q), len(q)
+    # One elastic variable for the rectangle and one for the height; their weighted sum
+    # is minimized.
     elastic = np.stack([~bounds.height, bounds.height], axis=1)
     rows = np.hstack([bounds.normals @ tip.jacobian, -elastic.astype(float)])
     sides = [(low - x, high - x) for low, high, x in zip(*region, q, strict=True)]

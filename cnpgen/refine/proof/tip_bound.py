@@ -28,6 +28,7 @@ class TipKinematics:
 
     def curvature(self, direction: Array) -> Array:
         """Return second derivatives along a direction, shape (n, n): ``c . (axis_i x J_j)`` for i <= j."""
+        # c . (axis_i x J_j) = axis_i . (J_j x c)
         upper = np.triu(self.axes.T @ np.cross(self.jacobian.T, direction).T)
         return np.asarray(upper + np.triu(upper, 1).T)
 
@@ -49,6 +50,8 @@ class ArmKinematics:
             for joint, stroke in zip(joints[1:], strokes[1:], strict=True)
         ]
         lengths.append(float(np.linalg.norm(robot.chain.tip_translation)))
+        # Joint i turns the tip at a radius of at most the lengths of all links after
+        # it.
         outer = np.cumsum(lengths[::-1])[::-1]
         # upper bounds of the derivatives of the tip's position by each joint, of any
         # order, shape (n,)
@@ -90,6 +93,7 @@ def bound_projection(
             continue
         joint = int(np.argmax(loss))
         center = (low[joint] + high[joint]) / 2
+        # A position at or below the threshold disproves the bound.
         if direction @ arm.at((low + high) / 2).position <= above or loss[joint] == 0:
             return None
         left, right = high.copy(), low.copy()
@@ -107,15 +111,20 @@ def _bound_box(
     """
     while True:
         half = (high - low) / 2
+        # Taylor series about the center of the box: value, gradient, curvature, and a
+        # bound of the rest.
         tip = arm.at((low + high) / 2)
         gradient, curvature = direction @ tip.jacobian, np.abs(tip.curvature(direction))
         second, third = _remainders(arm.reach * float(np.linalg.norm(direction)), half)
         change = curvature @ half + second
+        # A gradient that keeps its sign in the whole box puts the minimum on one of its
+        # sides.
         rising, falling = (
             (half > 0) & (gradient > change),
             (half > 0) & (-gradient > change),
         )
         if not (rising | falling).any():
+            # The joint with the largest contribution is split next.
             joint_loss = half * (np.abs(gradient) + change)
             loss = np.abs(gradient) @ half + half @ curvature @ half / 2 + third
             return low, high, float(direction @ tip.position - loss), joint_loss

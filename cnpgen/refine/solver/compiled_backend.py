@@ -195,6 +195,7 @@ class CompiledBackend:
         """
         selected = np.zeros((self._m, self._points), bool)
         missed = np.ascontiguousarray(selection.missed.T)
+        # The C code has residuals as rows and grid points as columns, (m, K).
         before = (
             None
             if selection.multipliers is None
@@ -254,6 +255,7 @@ class CompiledBackend:
         )
 
     def _describe(self, motion: Transcription, bounds: Bounds) -> _Motion:
+        # Rows of matrices are padded to whole vectors.
         spec, stride = motion.spec, motion.nx + 2 + -(motion.nx + 2) % MAX_LANES
         path = end_derivatives(spec.path_control_points, spec.degree)
         rate = end_derivatives(spec.rate_control_points, spec.degree)
@@ -367,6 +369,7 @@ class CompiledBackend:
 
     def _allocate(self, sizes: Sequence[int]) -> list[int]:
         """Return the addresses of arrays of so many numbers, aligned to cache lines."""
+        # Sizes are rounded up to cache lines, so that every array begins at one.
         lines = [size + -size % CACHE_LINE_DOUBLES for size in sizes]
         array = aligned_array(sum(lines))
         self._arrays.append(array)

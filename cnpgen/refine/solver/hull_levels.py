@@ -114,6 +114,8 @@ class HullFeedback:
     """Check of a motion's hulls between the points of a grid with phases s, shape (K,)."""
 
     def __init__(self, spec: TrajectorySpec, s: Array) -> None:
+        # States of each interval from its first grid point up to, but without, the
+        # last.
         fractions = np.arange(STATES_PER_INTERVAL) / STATES_PER_INTERVAL
         phases = (s[:-1, None] + np.diff(s)[:, None] * fractions).ravel()
         self._spec, self._phases = spec, s

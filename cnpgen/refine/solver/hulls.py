@@ -84,6 +84,7 @@ class Hulls:
             shape = with_held_object(
                 robot.shape, robot.held_shape, robot.chain, problem.object_size
             )
+            # The held object becomes a further body of the shape.
             kinds |= OBJECT_CONSTRAINTS
         constraints = [item for item in problem.constraint if isinstance(item, kinds)]
         self._poses_of_checker: Array | None = None
@@ -138,6 +139,7 @@ class Hulls:
             np.maximum.at(
                 accepted, group.columns, group.required - _tolerance(constraint)
             )
+        # Distance that is accepted below the required one.
         self.tolerances = self.min_distances - accepted
 
     def _pairs_of(
@@ -159,6 +161,7 @@ class Hulls:
         The result are distances [m], shape (K, m), at most ``MEASURED_RANGE_M`` above
         the required ones, nan if q is not finite.
         """
+        # The compiled code needs finite numbers.
         if not np.isfinite(q).all():
             return np.full((q.shape[1], len(self.min_distances)), np.nan)
         distances = np.repeat(
@@ -263,6 +266,8 @@ class Hulls:
             (False, self.self_distance),
         ):
             if required is not None:
+                # One search for each kind of pairs, with the largest distance of all
+                # constraints.
                 found[kind] = checker.close_bodies(
                     q, required + within, of_obstacles=kind
                 )

@@ -124,6 +124,8 @@ class CostTerm:
         for count, smoothing, weight in self.groups(counts).tolist():
             part = slice(first, first := first + int(count))
             squares = np.sum(e[part] * e[part], axis=0)
+            # rho = w (sqrt(e.e + s^2) - s) or w e.e; weights are those of d rho =
+            # weights e . de.
             size = np.sqrt(squares + smoothing**2)
             rho += weight * (size - smoothing if smoothing > 0 else squares)
             weights[part] = weight / size if smoothing > 0 else 2.0 * weight
@@ -141,6 +143,8 @@ def choose_cost_term(
     terms = read_objective(objective)
     if terms is None:
         terms = problem.objective.terms
+        # The weight of the command replaces that of the centrifugal term; further terms
+        # stay.
         if weight is not None:
             terms = (Centrifugal(weight=weight), *problem.objective.term)
     elif weight is not None:

@@ -234,6 +234,7 @@ class Transcription:
         assert self.kernels.cost_residuals is not None
         w = self.grid.cost_bases.states(path, rate)
         e, jacobian = self.kernels.cost_residuals(w)
+        # dt = ds / r: quadrature weights of the phase become those of time.
         weights = self.grid.cost_weights / w[4 * self.n]
         return e, jacobian.reshape(len(w), *e.shape), weights
 
@@ -254,6 +255,7 @@ class Transcription:
         row_weights = (weights * rho_derivative)[residual, k]
         gradient += (row_weights * e[residual, k]) @ rows
         half = rows * np.sqrt(row_weights)[:, None]
+        # The weights depend on r, too: d(1 / r) = -dr / r^2 with dr = B R d(log R).
         gradient[self.split :] -= (
             (weights * rho / (bases.rate[0] @ rate)) @ bases.rate[0] * rate
         )

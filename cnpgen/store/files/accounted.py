@@ -84,6 +84,8 @@ class Account:
         unknown = []
         for document in documents:
             for path, known in document.unread():
+                # Order: elements that are not reported, elements for other software,
+                # and those whose loss the caller accepts.
                 if _matches(path, self.known.harmless):
                     continue
                 if _matches(path, self.known.unused):
@@ -159,6 +161,7 @@ class AccountedMapping(dict[str, Any]):
     def unread(self) -> Iterator[tuple[str, set[str]]]:
         """Yield the paths of the outermost elements that were not read, with the known keys beside them."""
         for key, value in dict.items(self):
+            # An unread mapping is reported as a whole, without its entries.
             if key not in self._read:
                 known = self._read | self._known
                 yield (f"{self.path}.{key}" if self.path else key), known
@@ -193,6 +196,7 @@ class AccountedList(list[Any]):
 
     def __getitem__(self, index: Any) -> Any:
         self._read.update(
+            # Negative indices and slices are counted from the end.
             range(*index.indices(len(self)))
             if isinstance(index, slice)
             else [index % len(self) if len(self) else index]
@@ -224,6 +228,7 @@ def mark_read(value: Any) -> None:
     if isinstance(value, AccountedMapping):
         for entry in dict.values(value):
             mark_read(entry)
+        # Marks all keys of the mapping itself as read.
         value.items()
     elif isinstance(value, AccountedList):
         for entry in value:
@@ -239,6 +244,7 @@ def is_default(value: Any) -> bool:
         return all(is_default(entry) for entry in dict.values(dict(value)))
     if isinstance(value, list):
         entries = list(list.__iter__(value))
+        # A list of mappings has entries, even if these are empty.
         return not any(
             isinstance(entry, Mapping) or not is_default(entry) for entry in entries
         )
@@ -261,6 +267,7 @@ def _wrapped(value: Any, path: str, account: Account) -> Any:
 
 def _plain(path: str) -> str:
     """Return a path without the indices of lists."""
+    # "a[0].b[1]" becomes "a.b".
     head, *rest = path.split("[")
     return head + "".join(part.partition("]")[2] for part in rest)
 

@@ -50,6 +50,7 @@ def read_arrays(
         try:
             with zipfile.ZipFile(file) as archive:
                 members = archive.infolist()
+                # Stated sizes are limited before any member is decoded.
                 _check(sum(member.file_size for member in members), max_bytes)
                 size = sum(_size_as_floats(archive, member) for member in members)
                 is_stored = all(m.compress_type == zipfile.ZIP_STORED for m in members)
@@ -78,11 +79,13 @@ def _size_as_floats(archive: zipfile.ZipFile, member: zipfile.ZipInfo) -> int:
     with archive.open(member) as content:
         read_header = _HEADERS[np.lib.format.read_magic(content)]
         shape, _, dtype = read_header(content)
+        # Python integers do not overflow.
         size = int(np.prod([int(length) for length in shape], dtype=object))
         if dtype.hasobject or size * dtype.itemsize > member.file_size:
             raise ArchiveError(
                 f"array {member.filename!r} states {size:,} values of {dtype}, which it does not hold"
             )
+        # Readers convert numbers to float64.
         return size * max(dtype.itemsize, 8)
 
 

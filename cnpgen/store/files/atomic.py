@@ -71,6 +71,7 @@ def check_writable(path: Path) -> None:
         places = [path.absolute(), *path.absolute().parents]
         if path.is_file():
             places.pop(0).open("ab").close()
+        # A missing folder would be created in its nearest existing parent.
         folder = next(place for place in places if place.exists())
         with tempfile.TemporaryFile(dir=folder):
             pass
@@ -94,6 +95,8 @@ def committing(path: Path, work: Path | None = None) -> Iterator[Path]:
         folder.mkdir(parents=True, exist_ok=True)
         path.parent.mkdir(parents=True, exist_ok=True)
         yield temporary
+        # The content reaches the disk before its name, and the name before the call
+        # returns.
         _synchronize(temporary)
         temporary.replace(path)
         _synchronize(path.parent)
@@ -101,6 +104,7 @@ def committing(path: Path, work: Path | None = None) -> Iterator[Path]:
         raise machine_error("write", path, error) from error
     finally:
         with suppress(OSError):
+            # After a success the temporary name no longer exists.
             temporary.unlink()
 
 
@@ -147,6 +151,7 @@ def read_file(path: Path, *, max_bytes: int | None = None) -> bytes:
     """
     with _reading(path):
         status = path.stat()
+        # Reading a pipe or a device may block; a folder raises its own error below.
         if not stat.S_ISREG(status.st_mode) and not stat.S_ISDIR(status.st_mode):
             raise DatasetError(f"{path} is not a file")
         if max_bytes is not None and status.st_size > max_bytes:

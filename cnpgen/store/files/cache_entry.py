@@ -17,6 +17,7 @@ def read_entry(path: Path) -> bytes | None:
     try:
         if path.stat().st_size > MAX_ENTRY_BYTES:
             return None
+        # The first line is the sha256 of the rest.
         checksum, _, content = path.read_bytes().partition(b"\n")
     except OSError:
         return None
@@ -28,6 +29,8 @@ def write_entry(path: Path, content: bytes) -> None:
     try:
         write_file(path, _checksum(content) + b"\n" + content)
     except MachineError as error:
+        # Other failures, such as a read-only cache, are silent: the result is only not
+        # kept.
         cause = error.__cause__
         if isinstance(cause, OSError) and cause.errno in _FULL:
             warnings.warn(

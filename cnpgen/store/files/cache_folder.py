@@ -60,6 +60,7 @@ def usable_cache_folder(folder: Path) -> Path:
             "that is not writable for other users",
         )
     try:
+        # Permissions do not show whether the file system is read-only.
         with tempfile.TemporaryFile(dir=folder):
             return folder
     except OSError:
@@ -115,6 +116,7 @@ def exclusive_lock(lock: Path) -> Iterator[None]:
         with suppress(FileNotFoundError):
             # Independent of the umask.
             lock.chmod(stat.S_IRUSR | stat.S_IWUSR)
+        # After the wait the work is done without the lock: twice, but complete.
         end = time.monotonic() + MAX_LOCK_WAIT_S
         while not try_lock(file) and time.monotonic() < end:
             time.sleep(0.02)
@@ -206,6 +208,7 @@ def _permission_problem(path: Path, *, writable: bool = False) -> str:
     except FileNotFoundError:
         # Moved since it was listed.
         return ""
+    # Root may change any file in any case.
     if status.st_uid not in {0, os.geteuid()}:
         return f"as {path} belongs to another user (uid {status.st_uid})"
     if status.st_mode & _WRITABLE_FOR_OTHERS and not writable:

@@ -68,6 +68,7 @@ def with_checksum(content: bytes, *, kind: str, version: int) -> bytes:
 
     See ``write_with_checksum``.
     """
+    # HDF5 ignores the user block, so that other programs read the file, too.
     body = content[HEADER_BYTES:]
     head = f"{kind} {version}\nsha256 {hashlib.sha256(body).hexdigest()}\n"
     return head.encode().ljust(HEADER_BYTES, b"\0") + body
@@ -81,6 +82,8 @@ def verify_checksum(path: Path, *, kind: str, version: int) -> bool:
     """
     with machine_errors("read", path), path.open("rb") as file:
         block = file.read(HEADER_BYTES)
+        # A file of other software: HDF5 begins at once, or the block has no part of a
+        # header.
         if block.startswith(HDF5) or not _HEADER_PART.search(block):
             return False
         require_possible_size(path)
@@ -107,6 +110,7 @@ def _check_checksum(
         raise DatasetError(
             f"{path} has format version {int(head[2])}, this cnpgen reads version {version}: {remedy}"
         )
+    # The sha256 covers only the rest: the bytes after the header must be zero.
     if block != head[0].ljust(HEADER_BYTES, b"\0"):
         raise DatasetError(_CHANGED.format(path))
     if digest.encode() != head[3]:

@@ -54,6 +54,7 @@ def read_csv_table(path: Path, *, example: str) -> CsvTable:
             f"{path} has {size:,} bytes, expected a table of at most {MAX_TEXT_TABLE_BYTES:,}"
         )
     try:
+        # Spreadsheets write a byte order mark.
         with path.open(encoding="utf-8-sig", newline="") as file:
             lines = [
                 (number, row)
@@ -67,6 +68,7 @@ def read_csv_table(path: Path, *, example: str) -> CsvTable:
             f"{path} is empty: its first line must name columns, such as {example}"
         )
     names = [cell.strip() for cell in lines[0][1]]
+    # With these separators, decimal commas would be read as columns.
     if other := next((mark for mark in ";\t" if mark in "".join(names)), None):
         raise DatasetError(
             f"{path}: line 1: columns are separated by ',', got {other!r}; numbers have '.', as in 0.5"

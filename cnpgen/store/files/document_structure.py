@@ -75,6 +75,8 @@ def check_structure(value: Any, structure: Structure) -> None:
 def _check_list(value: Any, structure: Structure) -> None:
     if not isinstance(value, list):
         raise _structure_error("a list", value)
+    # A list that the fast check does not accept is checked entry by entry, which names
+    # the first wrong one.
     if isinstance(structure, Leaf) and _are_all(value, structure):
         return
     for index, item in enumerate(value):
@@ -89,10 +91,12 @@ def _check_table(value: Any, structure: Mapping[str, Structure]) -> None:
     if not isinstance(value, dict):
         raise _structure_error("a table", value)
     common = structure.get(ANY_KEY)
+    # Without a common structure only the required keys are checked; others are allowed.
     for key in value if common else structure:
         try:
             check_structure(value.get(key, _MISSING), common or structure[key])
         except StructureError as error:
+            # The path grows from the inside out.
             error.key_path.append(f".{key}")
             raise
 
@@ -119,11 +123,13 @@ def _is(value: Any, leaf: Leaf) -> bool:
         return value is not _MISSING
     if leaf is TEXT:
         return isinstance(value, str)
+    # In Python a bool is an int.
     if isinstance(value, bool):
         return False
     if leaf is WHOLE:
         return isinstance(value, int) and 0 <= value <= MAX_INTEGER
     if isinstance(value, int):
+        # Larger integers of JSON do not fit into int64.
         return abs(value) <= MAX_INTEGER
     finite = isinstance(value, float) and math.isfinite(value)
     return finite or (

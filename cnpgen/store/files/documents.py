@@ -124,6 +124,8 @@ def save_document(
 
     The keys "format" and "format_version" come first.
     """
+    # The checksum is that of the text with zeros in its place, which a reader can
+    # restore.
     text = render(plain({**document, "self_sha256": _BLANK})) + "\n"
     digest = hashlib.sha256(text.encode()).hexdigest()
     write_file(path, _CHECKSUM.sub(f'"self_sha256": "{digest}"\n}}\n', text), work=work)
@@ -149,6 +151,7 @@ def load_document(
             f"{path} has format version {actual}, this cnpgen reads version {version}: {remedy}"
         )
     checksum = _CHECKSUM.search(text)
+    # The same text as before the checksum was put in.
     blank = _CHECKSUM.sub(f'"self_sha256": "{_BLANK}"\n}}\n', text)
     if (
         actual is None
@@ -188,6 +191,8 @@ def _check_depth(value: Any) -> None:
         level = [
             item
             for items in inside
+            # Long lists of scalars are skipped without visiting their entries one by
+            # one.
             if not _NESTED.isdisjoint(map(type, items))
             for item in items
         ]

@@ -41,12 +41,16 @@ def output_lock(out: Path, lock: Path) -> Iterator[None]:
     with machine_errors("write", lock):
         file = lock.open("ab")
     with file:
+        # Another process may have removed the file between opening and locking; a lock
+        # on it would exclude nobody else.
         if not try_lock(file) or not _is_present(file, lock):
             text = f"another process is writing {out}: wait for it, or choose another {{out}}"
             raise UsageError(text, remedies={"out": None})
         try:
             yield
         finally:
+            # The name is removed before the lock ends: a process that waits then sees
+            # that its file is gone.
             lock.unlink(missing_ok=True)
             unlock(file)
 

@@ -62,8 +62,10 @@ def create_hdf5(buffer: io.BytesIO, *, userblock: int = 0, alignment: int = 64) 
 
     creation, access = h5p.create(h5p.FILE_CREATE), h5p.create(h5p.FILE_ACCESS)
     creation.set_userblock(userblock)
+    # Times in the file would make equal contents differ.
     creation.set_obj_track_times(False)
     access.set_fileobj_driver(h5fd.fileobj_driver, buffer)
+    # A fixed format version: the bytes do not depend on the installed HDF5.
     access.set_libver_bounds(h5f.LIBVER_V110, h5f.LIBVER_V110)
     access.set_alignment(1, alignment)
     return h5f.create(b"buffer", h5f.ACC_TRUNC, creation, access)
@@ -248,6 +250,7 @@ class Hdf5:
         from h5py import h5l, h5o
 
         if name not in self._opened:
+            # Soft and external links may lead to other files.
             if self._root.links.get_info(name.encode()).type != h5l.TYPE_HARD:
                 raise DatasetError(
                     f"{self.path} is damaged: its {name!r} is a link, and links are not followed"
@@ -301,7 +304,10 @@ class Hdf5:
 
     def _check_size(self, name: str, column: Column, chunk: tuple[int, ...]) -> None:
         """Raise an error if this and all previous columns are larger than a file of this size can contain."""
+        # The sum of all columns is limited: many of a permitted size could exhaust the
+        # memory.
         previous = sum(item.bytes for item in self._columns.values())
+        # HDF5 unpacks whole chunks, which may be larger than the dataset.
         declared = max(
             previous + column.bytes, math.prod(chunk) * column.dtype.itemsize
         )
@@ -399,6 +405,7 @@ def _checked_file(path: Path, content: bytes | None) -> Iterator[tuple[Any, int]
             f"cannot read {path}: its content does not fit into memory"
         ) from error
     except _DAMAGE as error:
+        # A failed system call is no damage of the file.
         if isinstance(error, OSError) and error.errno in _SYSTEM_ERRORS:
             raise machine_error("read", path, error) from error
         if content is None and not h5py.is_hdf5(path):

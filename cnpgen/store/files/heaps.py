@@ -58,8 +58,10 @@ def _is_consistent(file: BinaryIO, begin: int, size: int) -> bool:
     position = begin + _HEADER
     while position + _HEADER <= end:
         number, _, _, length = _unpack(file, position, "<HHIQ")
+        # Object 0 is the free space, the last one.
         if number == 0:
             return bool(position + length == end)
+        # Objects are padded to multiples of 8 bytes.
         position += _HEADER + (length + 7) // 8 * 8
     return bool(position <= end)
 

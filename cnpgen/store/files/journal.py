@@ -43,6 +43,7 @@ class JournalFile:
 
     def append(self, record: bytes) -> None:
         """Append a record and flush it to the disk."""
+        # Record: length, sha256, content; an incomplete one has another sha256.
         length = len(record).to_bytes(_LENGTH_BYTES, "little")
         with machine_errors("write", self.path):
             self._file.write(length + hashlib.sha256(record).digest() + record)
@@ -90,11 +91,13 @@ def _recover(path: Path, file: IO[bytes], magic: bytes) -> JournalFile:
     if not try_lock(file):
         raise UsageError(f"{path} is in use by another process")
     head = file.read(len(magic))
+    # A file that ended within the magic number is one of this kind, too.
     if not magic.startswith(head):
         raise DatasetError(f"{path} does not start with {magic!r}")
     journal = JournalFile(path, [], file, magic)
     if head == magic:
         journal.records = _read_records(file)
+        # The next record follows the last valid one.
         file.truncate()
     else:
         # A new file, or one that ended within its first line.
@@ -108,6 +111,7 @@ def _read_records(file: IO[bytes]) -> list[bytes]:
     header_bytes = _LENGTH_BYTES + _DIGEST_BYTES
     while len(header := file.read(header_bytes)) == header_bytes:
         record = file.read(
+            # A damaged length may be huge.
             min(int.from_bytes(header[:_LENGTH_BYTES], "little"), MAX_RECORD_BYTES)
         )
         if hashlib.sha256(record).digest() != header[_LENGTH_BYTES:]:

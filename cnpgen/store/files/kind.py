@@ -63,6 +63,7 @@ def kind_of_content(path: Path) -> str:
 
 def _is_text(head: bytes) -> bool:
     """Return whether bytes are printable UTF-8, ignoring an incomplete last character."""
+    # The first bytes may end within a character.
     text = head.decode(errors="replace").rstrip("\ufffd")
     return (
         bool(text)

@@ -50,6 +50,7 @@ def _remove(paths: Iterable[Path]) -> None:
 def _temporary(work: Path) -> Iterator[Path]:
     if not work.is_symlink():
         with suppress(OSError):
+            # A temporary name has four dots or more: .NAME.PROCESS.UUID.tmp.
             yield from [
                 path for path in work.glob(".*.tmp") if path.name.count(".") > 3
             ]
@@ -63,9 +64,12 @@ def _is_dead(path: Path) -> bool:
 
 def _is_alive(process: int) -> bool:
     try:
+        # Signal 0 only checks that the process exists.
         os.kill(process, 0)
     except ProcessLookupError:
         return False
+    # A process of another user cannot be signalled, but exists; doubtful files are
+    # kept.
     except (OSError, OverflowError):
         return True
     return True

@@ -34,6 +34,7 @@ def claim_files(
         MachineError: A file cannot be written or removed.
     """
     planned, earlier = set(names), _listed(folder)
+    # A file that the user edited is the user's.
     own = {name for name in earlier if _is_unchanged(folder / name, earlier[name])}
     if not force:
         _refuse_others(folder, pattern, planned, own)
@@ -91,6 +92,8 @@ def _listed(folder: Path) -> dict[str, str]:
         return {
             str(name): str(value)
             for name, value in files.items()
+            # An edited list must not name files outside the folder, which would be
+            # deleted.
             if not Path(name).is_absolute() and ".." not in Path(name).parts
         }
     except (OSError, ValueError, TypeError, KeyError, AttributeError):

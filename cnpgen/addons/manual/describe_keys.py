@@ -4,7 +4,7 @@ import dataclasses
 from collections.abc import Sequence
 from typing import Any, get_args
 
-from cnpgen.cli.describe import quantity, title_lines
+from cnpgen.addons.manual.describe import quantity, title_lines
 from cnpgen.cli.terminal import table
 from cnpgen.make.recipe import DatasetRecipe
 from cnpgen.pipelines.pipeline import Pipeline
@@ -90,6 +90,7 @@ def part_of(key: Key) -> type | None:
 
     None where it holds a value.
     """
+    # The entries of a list have the type of its first argument.
     found: type = get_args(key.hint)[0] if is_array(key) else key.hint
     if found in GROUPS:
         return found
@@ -112,6 +113,7 @@ def default_text(key: Key) -> str:
     """Describe the default of a key: ``"20 ms"``, or "required"."""
     if key.required:
         return "required"
+    # A table that may be left out has the defaults of its own keys.
     if part_of(key) and key.default not in (None, ()):
         return "those of its keys"
     return quantity(key.default, key.unit)
@@ -138,6 +140,7 @@ def _table_to_dict(cls: type) -> dict[str, Any]:
 def _key_to_dict(key: Key) -> dict[str, Any]:
     """Describe a key, and the table or the tables that it holds."""
     left_out, part = ("hint", "default", "since_version"), part_of(key)
+    # Types are no JSON; the default follows in the form of the file.
     content = {
         spec.name: getattr(key, spec.name)
         for spec in dataclasses.fields(key)

@@ -6,6 +6,7 @@ from textwrap import wrap
 from typing import Any
 
 from cnpgen.cli.terminal import LINE_WIDTH, table
+from cnpgen.make.any_recipe import Recipe
 from cnpgen.make.recipe import DatasetRecipe, recipe_digest
 from cnpgen.pipelines.pipeline import Pipeline
 from cnpgen.pipelines.stages.stage import Stage
@@ -25,8 +26,6 @@ from cnpgen.robots.urdf_parameters import urdf_parameters
 from cnpgen.schema import registry
 from cnpgen.schema.keys import PerJoint, Range, keys
 from cnpgen.store.joint_units import unit_of
-
-Recipe = Problem | Pipeline | DatasetRecipe
 
 LIMITS = {  # with their units at joints that turn
     "position_lower": "rad",
@@ -105,6 +104,7 @@ def describe_problem(problem: Problem) -> str:
         ("obstacle", f"{each.name}: {_obstacle(each)}") for each in problem.obstacle
     ]
     facts += [("motion", numbers(problem.trajectory))]
+    # The duration is always part of the objective; the text has the other terms.
     objective = numbers(problem.objective)
     facts += [
         ("objective", f"minimum time, and {objective}" if objective else "minimum time")
@@ -160,6 +160,7 @@ def _drive_rows(robot: Robot, drive: Drive) -> list[tuple[str, ...]]:
         ("dry", "N m", drive.coulomb),
         ("motor torque", "N m", drive.torque_limit),
     ]
+    # The line torque = at rest - slope |dq| reaches 0 at |dq| = at rest / slope.
     for number, line in enumerate(drive.lines, 1):
         columns += [
             (f"line {number} at rest", "N m", line.torque),
@@ -304,6 +305,7 @@ def _limit_rows(problem: Problem, robot: Robot) -> list[tuple[str, ...]]:
         ("torque", "N m", [f"{x:.4g}" for x in robot.torque_limit]),
         ("base", "rad", [f"{x:.4g}" for x in robot.home]),
     ]
+    # The limit of jerks is shown where the problem uses it or states it.
     spoken_of = problem.uses_jerk or problem.limits.jerk is not None
     shown = [
         (name, *with_units(robot.units(unit), cells))
@@ -319,6 +321,7 @@ def with_units(units: str, cells: Sequence[str]) -> tuple[str, ...]:
     Cells have theirs where joints turn and slide.
     """
     each = [unit_of(units, index) for index in range(len(cells))]
+    # Equal units are written once, others behind each value.
     if len(set(each)) == 1:
         return f"[{each[0]}]", *cells
     return "", *(f"{cell} {unit}" for cell, unit in zip(cells, each, strict=True))
@@ -336,6 +339,7 @@ def numbers(obj: Any, *, leave_out: Sequence[str] = ()) -> str:
         for key in keys(type(obj))
         if key.name not in leave_out
     ]
+    # A key at its default is shown if this says something: not for none, 0 and "".
     shown = [(key, value) for key, value in values if value != key.default or value]
     return ", ".join(f"{key.name} {quantity(value, key.unit)}" for key, value in shown)
 
@@ -360,6 +364,7 @@ def _number(value: Any) -> str:
     if isinstance(value, float):
         return f"{value:.6g}"
     if isinstance(value, tuple) and value:
+        # Several ranges are the sides of a box.
         joint = " x " if isinstance(value[0], Range) else ", "
         text = joint.join(_number(item) for item in value)
         return text if joint == " x " else f"({text})"
@@ -374,6 +379,7 @@ def kind_name(item: Stage | Constraint) -> str:
 
 def recipe_to_dict(recipe: Recipe) -> dict[str, Any]:
     """Describe a recipe for JSON: everything it refers to resolved, in SI units, with derived values."""
+    # A data set has a pipeline, and a pipeline has a problem.
     pipeline = recipe.pipeline if isinstance(recipe, DatasetRecipe) else recipe
     problem = pipeline.problem if isinstance(pipeline, Pipeline) else pipeline
     robot = load_robot(problem)
