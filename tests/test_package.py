@@ -336,6 +336,8 @@ OPTIONAL = {  # package that cnpgen imports -> extra that installs it, function 
     "pandas": ("pandas", lambda: frame("pandas")),
     "pyarrow": ("parquet", lambda: trajectories(".parquet")),
     "yaml": ("ros", lambda: trajectories(".yaml")),
+    "rosbags": ("bags", lambda: trajectories(".mcap")),
+    "lerobot": ("lerobot", bridge("lerobot", "ChunkStep")),
     "argcomplete": ("completion", lambda: complete_words(build_parser([]))),
     "fsspec": ("hub", lambda: load_dataset("memory://hits")),
     "huggingface_hub": (

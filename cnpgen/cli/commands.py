@@ -18,8 +18,6 @@ _CORE = {  # command -> module of cnpgen.cli, in the order of the help
     "merge": "merge_command",
     "extend": "extend_command",
     "copy": "copy_command",
-    "list": "list_command",
-    "show": "show_command",
     "inspect": "inspect_command",
     "validate": "validate_command",
     "train": "train_command",

@@ -17,7 +17,7 @@ from cnpgen.cli.parser import Parser
 from cnpgen.errors import UsageError
 
 if TYPE_CHECKING:
-    from cnpgen.cli.describe import Recipe
+    from cnpgen.make.any_recipe import Recipe
 
 _NEXT = {
     "dataset": "cnpgen make-dataset {0}",
@@ -41,7 +41,7 @@ def add_options(parser: Parser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> None:
-    from cnpgen.cli.show_command import load_any
+    from cnpgen.make.any_recipe import load_any
     from cnpgen.schema.keys import NAME
     from cnpgen.store.files.atomic import check_writable, write_file
 

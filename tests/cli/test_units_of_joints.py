@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import cnpgen
-from cnpgen.cli.describe import describe_problem, recipe_to_dict, with_units
+from cnpgen.addons.manual.describe import describe_problem, recipe_to_dict, with_units
 from cnpgen.judges.plans.judge import judge
 from cnpgen.kernels.library import problem_kernels
 from cnpgen.loader.dataset import make_frame

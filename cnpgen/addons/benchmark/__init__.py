@@ -2,6 +2,6 @@
 
 from cnpgen.schema.public_names import lazy_exports
 
-NEEDS = ("paper", "scene_files", "trajectories")
+NEEDS = ("manual", "paper", "scene_files", "trajectories")
 
 __getattr__, __dir__ = lazy_exports(__name__, __file__)

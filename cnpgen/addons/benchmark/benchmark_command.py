@@ -257,7 +257,7 @@ def _listing(*, as_json: bool) -> str:
 def _planners() -> tuple[dict[str, str], dict[str, str]]:
     """Describe the planners, or why they cannot be used, and their fields by the names for ``--set``."""
     from cnpgen.addons.benchmark.benchmark_planner import PLANNERS, load_kind
-    from cnpgen.cli.describe_keys import kind_summary
+    from cnpgen.addons.manual.describe_keys import kind_summary
     from cnpgen.schema import registry
     from cnpgen.schema.keys import keys
 

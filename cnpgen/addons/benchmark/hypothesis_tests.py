@@ -171,8 +171,10 @@ def _ratio(key: str, rows: Keyed, others: Keyed) -> dict[str, Any]:
         _means({at: {key: known.get(key, False)} for at, known in part.items()}, key)
         for part in (rows, others)
     )
+    # Repetitions are not independent, so the interval counts problems.
     low, high = wilson(count / max(of, 1), len(mine))
     pairs = _pairs(mine, theirs)
+    # Means of repetitions may be fractions, which McNemar's test does not take.
     is_binary = not np.any(pairs % 1)
     p = mcnemar(*(pairs.T > 0)) if is_binary else wilcoxon(pairs)
     return {
@@ -236,6 +238,8 @@ def wilson(share: float, n: int) -> tuple[float, float]:
     if n == 0:
         return 0.0, 1.0
     z2 = NORMAL_QUANTILE_95**2
+    # With d = 1 + z^2 / n, the center is (p + z^2 / 2n) / d, and the half width
+    # z sqrt(p (1 - p) / n + z^2 / 4n^2) / d.
     center = (share + z2 / (2 * n)) / (1 + z2 / n)
     half = (
         NORMAL_QUANTILE_95
@@ -252,6 +256,7 @@ def holm(p_values: Sequence[float]) -> list[float]:
     order = np.argsort(p_values, kind="stable")
     factors = np.arange(len(order), 0, -1)
     corrected = np.empty(len(order))
+    # The k-th smallest of m p-values times m - k + 1, and at least the one before.
     corrected[order] = np.minimum(
         np.maximum.accumulate(factors * np.asarray(p_values, float)[order]), 1.0
     )
@@ -263,6 +268,7 @@ def mcnemar(mine: Any, theirs: Any) -> float:
     from scipy.stats import binomtest
 
     only_mine, only_theirs = int(np.sum(mine & ~theirs)), int(np.sum(theirs & ~mine))
+    # Problems that both or none solve say nothing about a difference.
     both = only_mine + only_theirs
     return float(binomtest(only_mine, both).pvalue) if both else 1.0
 
@@ -271,6 +277,7 @@ def wilcoxon(pairs: Any) -> float:
     """Return the p-value of Wilcoxon's signed-rank test of pairs of figures, shape (N, 2)."""
     from scipy.stats import wilcoxon as signed_ranks
 
+    # Without a difference, the test is undefined.
     if len(pairs) == 0 or not np.any(pairs[:, 0] != pairs[:, 1]):
         return 1.0
     return float(

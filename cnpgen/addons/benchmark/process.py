@@ -69,9 +69,12 @@ class PlannerProcess:
             return self._unprepared
         assert self._pipe is not None
         assert self._process is not None
+        # A stopped planner reports nothing, so its times are measured from here, too.
         start, used = time.perf_counter(), cpu_time_of(self._process.pid)
         try:
             self._pipe.send(problem)
+            # Planners may end a little after their limit; their answer then does not
+            # count.
             if self._pipe.poll(self._setting.time_limit + STOP_MARGIN_S):
                 return self._in_time(self._pipe.recv())
         except (EOFError, OSError):
@@ -213,6 +216,7 @@ def _plan_once(plan: Plan, problem: Plans) -> PlanningOutcome:
     """Plan for one problem and measure the time."""
     start, cpu = time.perf_counter(), _cpu_time()
     try:
+        # Times begin once the number of threads is set, which takes time itself.
         with one_thread():
             start, cpu = time.perf_counter(), _cpu_time()
             try:
@@ -236,6 +240,8 @@ def _content(answer: Any, problem: Plans) -> dict[str, Any] | None:
     ):
         raise UsageError(f"expected one plan, a Trajectory or None, got {answer!r:.60}")
     content = answer_to_dict(answer)
+    # An answer that cannot be read fails here, with its problem, and not in a later
+    # run.
     answer_from_dict(problem, content)
     return content
 

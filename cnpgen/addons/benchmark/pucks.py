@@ -172,6 +172,7 @@ def scenario_problems(scenario: ReplanningScenario) -> tuple[Plans, ExecutedPref
         RecipeError: A puck cannot be hit, or a first motion ends before the switch.
     """
     first = solve_plans(hits_of(scenario.pucks), workers=1).plans
+    # The grid is symmetric about its centre: the reversed order is the opposite puck.
     opposite = scenario.pucks.positions()[:, ::-1]
     problems = []
     min_duration = first.duration.min()
@@ -179,9 +180,11 @@ def scenario_problems(scenario: ReplanningScenario) -> tuple[Plans, ExecutedPref
         if time >= min_duration:
             text = f"a first motion ends after {min_duration:.3f} s, the switch is at {time:g} s"
             raise RecipeError([f"replanning.switch_times: {text}"])
+        # The second motion starts from the states of the first ones at the switch.
         problems.append(hits_from(scenario.pucks, opposite, first.states_at(time)))
     joined, prefix = concatenate(problems), concatenate([first] * len(problems)).motion
     until = np.repeat(scenario.switch_times, len(first))
+    # Every switch of every first motion is a problem of its own.
     return replace(joined, sample_id=np.arange(len(joined))), ExecutedPrefix(
         prefix, until
     )

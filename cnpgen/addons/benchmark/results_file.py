@@ -90,6 +90,7 @@ class Results:
 
     def _merge(self, row: dict[str, Any]) -> None:
         known = self.rows.setdefault(row["problem"], {})
+        # Executions of several plants add up; other keys of a row are replaced.
         executed = {**known.get("executed", {}), **row.get("executed", {})}
         known |= row
         if executed:
@@ -126,6 +127,7 @@ def open_results(
             )
         lines = lines[1:] if lines and lines[0] == head and not discard else []
     results = _read_rows(path, lines)
+    # The file is rewritten without an incomplete last line.
     write_file(path, "".join(f"{line}\n" for line in (head, *lines)).encode())
     return results
 
@@ -135,6 +137,7 @@ def _differences(line: str, head: str) -> str:
     one, other = json.loads(line), json.loads(head)
     if not isinstance(one, dict):
         return "it has no head"
+    # A digest says nothing to a reader; the other keys name the difference.
     keys = [
         key for key in other if one.get(key) != other[key] and key != "suite_sha256"
     ]
@@ -275,6 +278,7 @@ class ResultsFolder:
         self._shared = {
             "suite": suite.name,
             "suite_version": suite.version,
+            # Parameters of planners are part of each file, not of the suite's identity.
             "suite_sha256": canonical_sha256(
                 plain(resolved(replace(suite, planners=None)))
             ),

@@ -175,6 +175,7 @@ def run_benchmark(
     with concerning("suite"):
         loaded = suite if isinstance(suite, Suite) else load_suite(suite)
     given = _checked_planners(planners, loaded.planners or {}, parameters or {})
+    # Planners, plants and their parameters are checked before any planning.
     values = {name: _checked_parameters(name, given[name]) for name in planners}
     robots = _checked_plants(plants, chosen.environment)
     problems, prefix = loaded.problems(n)
@@ -207,6 +208,7 @@ def run_benchmark(
                 report = partial(progress or (lambda *_: None), activity)
                 _execute_all(results, plant, problems, prefix, pool=pool, report=report)
     rows = place.rows(planners)
+    # The folder may have results of more problems than this run.
     count = max(
         (row["problem"] + 1 for part in rows.values() for row in part), default=0
     )
@@ -318,10 +320,12 @@ def _plan_in_pool(
     pool: WorkerPool, name: str, setting: Setting, waiting: list[Numbered]
 ) -> Rows:
     """Yield the rows of problems that are distributed over a worker pool."""
+    # Small parts keep all workers busy, larger ones save starts of planners.
     size = min(PROBLEMS_PER_TASK, -(-len(waiting) // pool.size))
     parts = (waiting[first : first + size] for first in range(0, len(waiting), size))
     with closing(pool.distribute(partial(_plan_task, name, setting), parts)) as results:
         for rows in results:
+            # Planning times with others on the machine are marked as such.
             yield from ({**row, "planners_at_once": pool.size} for row in rows)
 
 
@@ -360,6 +364,7 @@ def verdict_to_dict(verdict: Verdict) -> dict[str, Any]:
         "value_over_bound": {
             name: abs(margin.value) / abs(margin.bound)
             for name, margin in verdict.margins.items()
+            # A bound of 0 has no ratio.
             if margin.bound and np.isfinite(margin.value / margin.bound)
         },
         "severity": {

@@ -59,6 +59,7 @@ class Names:
 
 def source_text(parts: PlannerParts, names: Names) -> str:
     """Return the C file."""
+    # Functions are defined before others that call them.
     functions = [
         *(_tape_functions(parts)),
         network_text(parts),
@@ -126,10 +127,12 @@ def _elementary(body: str) -> str:
     pending = [body]
     while pending:
         text = pending.pop()
+        # Functions that are found may use further ones.
         for name in defined.keys() - used:
             if re.search(rf"\b{name}\(", text):
                 used.add(name)
                 pending.append(defined[name])
+    # The order of the file is kept: each function follows those that it uses.
     return (
         "\n\n".join([introduction, *(defined[n] for n in defined if n in used)]) + "\n"
     )
@@ -149,6 +152,7 @@ def _tape_functions(parts: PlannerParts) -> list[str]:
         "position_violations": parts.position_constraints,
     }
     texts += [
+        # Checks without constraints have no rows and no function.
         grid_function(parts.tapes[name], name, phases)
         for name, phases in GRID_TAPES.items()
         if name in parts.tapes and rows.get(name, True)
@@ -159,6 +163,7 @@ def _tape_functions(parts: PlannerParts) -> list[str]:
 def _plan(parts: PlannerParts) -> str:
     """Return the functions of the header."""
     fit, scale = parts.parametrization is not None, parts.scaling is not None
+    # Time scaling is the fallback where the parametrization finds no rates.
     fit_rates = {
         (False, False): "",
         (True, False): "parametrize(motion, memory);",
@@ -273,7 +278,9 @@ def _memory(parts: PlannerParts) -> str:
     )
     inputs = {name: sum(t.inputs) for name, t in parts.tapes.items()}
     phases, rows = size["PHASES"], size["CHECKED_PHASES"]
+    # Both checks use the same memory, one after the other.
     most_rows = max(size["MOVING_ROWS"] * phases, size["POSITION_ROWS"] * rows, 1)
+    # Functions of one point share the memory of their inputs.
     points = [
         inputs[name]
         for name in ("task", "line_change", "projected_path")

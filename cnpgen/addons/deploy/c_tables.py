@@ -44,6 +44,7 @@ def sizes(parts: PlannerParts) -> dict[str, int]:
     model, spec, problem = parts.model, parts.problem.trajectory, parts.problem
     n, fixed, blocks = parts.robot.n, model.fixed_at_goal, model.features.blocks
     first = blocks.index("expected_time") if "expected_time" in blocks else -1
+    # The C code replaces the time in the features by its logarithm, at this index.
     before = count_features(blocks[: max(first, 0)], n, len(problem.parameters))
     orders, edges = problem.path_orders, cells(parts)
     values = {
@@ -65,6 +66,7 @@ def sizes(parts: PlannerParts) -> dict[str, int]:
         "LINE_STEPS": int("line_change" in parts.tapes),
         "ORDERS": orders,
         "JERK": int(orders > 3),
+        # Derivatives of p, those of r, and the scene.
         "COLUMNS": n * orders + orders - 1 + problem.scene_width,
         "PHASES": len(parts.phases),
         "CHECKED_PHASES": len(parts.checked_phases),
@@ -72,6 +74,7 @@ def sizes(parts: PlannerParts) -> dict[str, int]:
         "POSITION_ROWS": len(parts.position_constraints),
         "MOVING_ROWS": len(parts.moving_constraints),
         "CELLS": len(edges) - 1,
+        # Steps of a bisection over the edges.
         "CELL_STEPS": ceil(log2(len(edges))) + 1,
         "NODES": GAUSS_NODES,
         "NEWTON_STEPS": NEWTON_STEPS,
@@ -150,12 +153,14 @@ def _task_tables(parts: PlannerParts) -> Iterable[str]:
 def _spline_tables(parts: PlannerParts) -> Iterable[str]:
     spec = parts.problem.trajectory
     edges, spans = cells(parts), spec.rate_control_points - spec.degree
+    # The midpoint of a cell is inside its span of knots in spite of rounding.
     midpoints = (edges[1:] + edges[:-1]) / 2
     nodes, weights = np.polynomial.legendre.leggauss(GAUSS_NODES)
     yield table("double", "path_taylor", _taylor(spec.path_control_points, spec.degree))
     yield table("double", "rate_taylor", _taylor(spec.rate_control_points, spec.degree))
     yield table("double", "cell_edge", edges)
     yield table("int", "cell_span", np.floor(midpoints * spans))
+    # Nodes and weights of [-1, 1] are mapped to [0, 1].
     yield table("double", "node", (nodes + 1) / 2)
     yield table("double", "node_weight", weights / 2)
 
@@ -187,6 +192,7 @@ def _grid_tables(parts: PlannerParts) -> Iterable[str]:
 def _range(table_of_basis: Array) -> NDArray[np.int64]:
     """Return first and last phase, in whole lanes, at which each function or a derivative is not 0, shape (points, 2)."""
     nonzero = (table_of_basis != 0).any(axis=0)
+    # Ranges begin and end at whole lanes.
     first = nonzero.argmax(axis=1)
     last = nonzero.shape[1] - nonzero[:, ::-1].argmax(axis=1)
     return np.stack([first - first % LANES, last + -last % LANES], axis=1)
@@ -197,6 +203,7 @@ def _support(table_of_basis: Array) -> NDArray[np.int64]:
     orders, points, _ = table_of_basis.shape
     groups = table_of_basis.reshape(orders, points, -1, LANES)
     nonzero = (groups != 0).any(axis=(0, 3)).T
+    # The reversed search finds the last function that is not 0.
     end = points - nonzero[:, ::-1].argmax(axis=1)
     return np.stack([nonzero.argmax(axis=1), end], axis=1)
 
@@ -230,10 +237,12 @@ def network_text(parts: PlannerParts) -> str:
             table("float", f"{layer.name}_bias", _filled(bias[None])[0]),
         ]
     steps = ["  const float *x = memory->x;\n"]
+    # Two memories alternate: each layer reads one and writes the other.
     for index, layer in enumerate(architecture.trunk):
         steps.append(_step(layer, "x", f"memory->hidden[{index % 2}]", activated=True))
         steps.append(f"  x = memory->hidden[{index % 2}];\n")
     hidden, path, rate = architecture.heads
+    # The last layer is in one memory, so the head of the path uses the other one.
     other = f"memory->hidden[{len(architecture.trunk) % 2}]"
     steps += [
         _step(rate, "x", "memory->log_rate", activated=False),
@@ -262,10 +271,13 @@ def _filled(matrix: NDArray[Any]) -> NDArray[Any]:
     """Fill rows up to a multiple of ``INPUTS``, and columns up to whole blocks, with zeros."""
     rows, columns = matrix.shape
     more = padded(rows, INPUTS) - rows, padded(columns) - columns
+    # Zero weights add nothing: padding changes no result.
     return np.pad(matrix, ((0, more[0]), (0, more[1])))
 
 
 def _blocked(weight: NDArray[Any]) -> NDArray[Any]:
     """Return a matrix as blocks of columns, shape (blocks, inputs, LAYER_BLOCK)."""
     filled = _filled(weight)
+    # All inputs of a block of outputs are contiguous, in the order in which they are
+    # read.
     return filled.reshape(len(filled), -1, LAYER_BLOCK).swapaxes(0, 1)

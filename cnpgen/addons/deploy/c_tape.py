@@ -48,6 +48,8 @@ def _lines(body: str) -> str:
     """Replace the vector types of kernels by numbers, and leave out values that no other line reads."""
     kept: list[str] = []
     read: set[str] = set()
+    # Lines read only values of earlier ones: backward, all readers of a value are
+    # known.
     for line in reversed(body.splitlines()):
         names = _NAME.findall(line)
         if line.startswith("v ") and not read.intersection(_defined(line)):
@@ -63,6 +65,7 @@ def _defined(line: str) -> list[str]:
 
 
 def _in_doubles(line: str) -> str:
+    # Sine and cosine are written by reference, so they are not constant.
     kind = "double " if "vsincos(" in line else "const double "
     line = kind + line.removeprefix("v ") if line.startswith("v ") else line
     return re.sub(r"\bone/", "1.0/", re.sub(r"\bK\(", "(", line))

@@ -45,6 +45,7 @@ def string_literal(text: str) -> str:
     )
     content = "".join(
         chr(byte) if byte in plain else f"\\{byte:03o}"
+        # Three digits end an octal escape, whatever character follows.
         for byte in text.encode("utf-8", "surrogatepass")
     )
     return f'"{content}"'
@@ -57,6 +58,7 @@ def number(value: float) -> str:
         return "NAN"
     if np.isinf(value):
         return "INFINITY" if value > 0 else "-INFINITY"
+    # The shortest decimal that reads back as the same float64.
     return repr(value) if value else "0"
 
 

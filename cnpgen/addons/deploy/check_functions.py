@@ -53,6 +53,7 @@ def position_violations(robot: Robot, problem: Problem) -> Any:
     off_sx, off = symbols("off", len(relaxed(problem)))
     relaxation = {
         index: value * _opening(phase)
+        # Relaxations are inputs: they depend on the start, not on the phase.
         for index, value in zip(relaxed(problem), off, strict=True)
     }
     rows = [row for _, row in _worst(problem, state, moving, False, relaxation)]
@@ -107,10 +108,12 @@ def _state_on_path(
     widths = (*[robot.n] * orders, orders - 1, problem.scene_width)
     columns, scalars = zip(*map(symbols, names, widths), strict=True)
     p, *path, rate, poses = scalars
+    # Derivatives by time follow from those by the phase and from r = ds/dt.
     dq, ddq, jerk = time_derivatives(path, rate)
     state = SymbolicState(
         robot, p, dq, ddq, poses, problem.obstacle, problem.object_size, jerk
     )
+    # A condition depends on velocity if it depends on one of these columns.
     moving = [
         ca.vertcat(columns[order], columns[orders][order - 1])
         for order in range(1, orders)
@@ -129,6 +132,7 @@ def _worst(
     import casadi as ca
 
     for index, constraint in enumerate(problem.constraint):
+        # Constraints are evaluated alone, so that each has a row of its own.
         alone = replace(problem, constraint=(constraint,))
         violations = [
             violation
@@ -153,6 +157,7 @@ def _violations(
         isinstance(constraint, TipManifold) and condition.name == constraint.held_name
     )
     relaxed_by = relaxation if held else 0.0
+    # Valid motions may use the tolerance, which is 1 in these units.
     units = np.maximum(constraint.allowed(condition), MIN_TOLERANCE)
     violations = []
     for value, low, high, unit in zip(
@@ -170,4 +175,5 @@ def _violations(
 def _column(values: Vec) -> Any:
     import casadi as ca
 
+    # Structural zeros are outputs, too: rows keep their numbers.
     return ca.densify(ca.vertcat(*values)) if values else ca.SX(0, 1)

@@ -54,6 +54,7 @@ def input_ranges(
     if rows is not None:
         low, high, count = _of_dataset(model, loaded, rows)
         source = f"smallest and largest values in {count:,} training rows of a dataset"
+        # Rows at the edge of the ranges are inside in spite of rounding.
         return InputRanges(low - ROUNDING_TOLERANCE, high + ROUNDING_TOLERANCE, source)
     if stored is not None:
         low, high = np.array(stored["low"], float), np.array(stored["high"], float)
@@ -92,6 +93,7 @@ def _of_dataset(
         fixed_at_goal=model.fixed_at_goal,
         placed=(),
     )
+    # Blocks bound the memory of the features.
     parts = [
         model.features.of(prepare(boundary[first : first + ROWS_PER_BLOCK]), "float64")
         for first in range(0, len(boundary), ROWS_PER_BLOCK)

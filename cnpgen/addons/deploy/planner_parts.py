@@ -106,6 +106,7 @@ class PlannerParts:
             "ddq": self.robot.acceleration_limit,
         }
         rows = [
+            # Conditions on positions have no tolerance.
             limits.get(name.partition("_")[2], np.zeros(self.robot.n))
             for name in self.conditions
         ]
@@ -115,6 +116,7 @@ class PlannerParts:
     def parameter_ranges(self) -> tuple[Array, Array]:
         """Bounds of the parameters, relaxed by rounding errors, shape (P,) each."""
         spans = self.problem.parameters.ranges
+        # Rounding errors are relative to the larger bound.
         rounding = [RANGE_ROUNDING * max(abs(s.low), abs(s.high)) for s in spans]
         low = [span.low - error for span, error in zip(spans, rounding, strict=True)]
         high = [span.high + error for span, error in zip(spans, rounding, strict=True)]
@@ -155,6 +157,7 @@ def planner_parts(
         if model.config.time_parametrized
         else None
     )
+    # Time can be scaled only if both ends are at rest.
     scaling = speed_bounds(robot, problem) if model.is_rest_to_rest else None
     tapes = _tapes(model, kernels, parametrized=parametrization is not None)
     phases = _phases(model)
@@ -220,6 +223,7 @@ def _phases(model: Model) -> Array:
     elif at_rest:
         intervals = SCALING_INTERVALS
     phases = chebyshev(intervals)
+    # A repeated phase changes no maximum over the grid.
     return np.append(phases, np.ones(-len(phases) % LANES))
 
 
@@ -228,12 +232,14 @@ def _stride(tape: Tape, phases: int) -> int:
     return next(
         stride
         for stride in (1, 2, 4)
+        # The largest stride is used whatever the work is.
         if stride == 4 or len(tape) * phases / stride <= MAX_POSITION_WORK
     )
 
 
 def _checked_phases(phases: Array, stride: int) -> list[int]:
     """Return the indices of every ``stride``-th phase and the last one, in whole groups of ``LANES``."""
+    # The first of the equal last phases.
     last = int(np.argmax(phases))
     indices = sorted({*range(0, last + 1, stride), last})
     return [*indices, *[last] * (-len(indices) % LANES)]

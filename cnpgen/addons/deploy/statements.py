@@ -51,6 +51,7 @@ def statements(
         if name == "OUTPUT":
             lines.append(write(b, int(constant), names[a]))
             continue
+        # Later uses of the same angle take the values that are computed already.
         if name in ("SIN", "COS"):
             if a not in angles:
                 lines.append(f"v s{a},c{a};vsincos({names[a]},&s{a},&c{a});")
@@ -67,6 +68,7 @@ def statements(
                 else _EXPRESSIONS
             )
             expression = templates[name].format(names[a], names[b])
+            # Minimum and maximum are nan only if both operands are.
             never_nan |= {k} if name in _WITHOUT_NAN and never_nan & {a, b} else set()
         names[k] = f"t{k}"
         lines.append(f"v t{k}={expression};")

@@ -34,6 +34,7 @@ class Furniture:
     def point(self, local: Point) -> Point:
         """Return a point in the frame of the robot's base [m]."""
         x, y, z = local
+        # Rotation about z by the yaw, then the shift to the origin.
         cos, sin = math.cos(self.yaw), math.sin(self.yaw)
         return (
             self.origin[0] + cos * x - sin * y,
@@ -124,6 +125,7 @@ def place_objects(
     for index in range(whole(random, count)):
         a, b, height = (uniform(random, size) for size in (widths, widths, heights))
         is_box = bool(random.random() < 0.5)
+        # The circle round the base, whatever the turn of a box.
         radius = math.hypot(a, b) / 2 if is_box else a / 2
         for _ in range(MAX_PLACEMENTS):
             x = area[0] + (area[1] - area[0]) * random.random()
@@ -133,6 +135,7 @@ def place_objects(
                 for u, v, r in circles
             ):
                 break
+        # An object without a free place is left out.
         else:
             continue
         circles.append((x, y, radius))
@@ -147,8 +150,10 @@ def place_objects(
         else:
             furniture.cylinder(name, center, a / 2, height)
         if from_above:
+            # The tip is above the object, and approaches downward.
             furniture.grasp((x, y, z + height + GRASP_GAP_M), (0, 0, -1))
         else:
+            # At half the height of the object, but at least 6 cm above its base.
             furniture.grasp(
                 (x - radius - GRASP_GAP_M, y, z + max(height / 2, 0.06)), (1, 0, 0)
             )

@@ -41,6 +41,7 @@ class Bookshelf(SceneFamily):
         )
         spacing = uniform(random, self.spacing)
         height = levels * spacing
+        # One board more than levels: the top board closes the last one.
         for level in range(levels + 1):
             shelf.box(
                 f"board {level + 1}",
@@ -54,6 +55,7 @@ class Bookshelf(SceneFamily):
         for level in range(levels):
             z, area = (
                 level * spacing + SHELF_BOARD_M / 2,
+                # Objects keep a distance from the front, the back and the sides.
                 (0.12, depth - 0.08, -width / 2 + 0.12, width / 2 - 0.12),
             )
             place_objects(
@@ -66,6 +68,7 @@ class Bookshelf(SceneFamily):
                 prefix=f"object {level + 1}",
             )
             y = float(random.uniform(area[2], area[3]))
+            # A free place in front of the objects, halfway between two boards.
             shelf.grasp((0.08, y, z + spacing / 2), (1, 0, 0), tilt=0.4)
         return shelf.layout()
 
@@ -151,6 +154,7 @@ class Cubby(SceneFamily):
                 (depth, thin, height - z - thin),
             ),
         }
+        # All cubbies draw it, so merged ones have no other walls.
         removed = list(walls)[int(random.integers(len(walls)))]
         for name, (center, size) in walls.items():
             if not (self.merged and name == removed):
@@ -179,6 +183,7 @@ def _cell_grasps(
     for low_y, high_y in columns:
         for low_z, high_z in rows:
             for _ in range(2):
+                # The middle 30 % of a cell are away from its walls.
                 y = low_y + (high_y - low_y) * random.uniform(0.35, 0.65)
                 z = low_z + (high_z - low_z) * random.uniform(0.35, 0.65)
                 cubby.grasp(

@@ -39,6 +39,8 @@ class Tabletop(SceneFamily):
         first = uniform(random, self.bearing)
         side = 1.0 if random.random() < 0.5 else -1.0
         for index in range(whole(random, self.tables)):
+            # The second and the third table are at right angles to the first, on either
+            # side.
             bearing = first + (0.0, side, -side)[index] * math.pi / 2
             distance, height = (
                 uniform(random, self.distance),
@@ -95,7 +97,10 @@ class TablePick(SceneFamily):
             random, table, (0.08, 0.47, -0.37, 0.37), 0.0, objects, from_above=True
         )
         # Low places beside the objects.
+        # The first obstacle is the table itself.
         for obstacle in list(table.obstacles[1:]):
+            # Positions are in the frame of the robot's base, and grasps in that of the
+            # table.
             x, y, _ = obstacle.position or (0.0, 0.0, 0.0)
             dx, dy = x - table.origin[0], y - table.origin[1]
             cos, sin = math.cos(table.yaw), math.sin(table.yaw)
@@ -135,6 +140,7 @@ class TableUnderPick(SceneFamily):
                 y * (width - leg) / 2,
                 (floor + top) / 2,
             )
+            # Legs end at the lower face of the top.
             table.box(f"leg {index}", center, (leg, leg, top - floor - BOARD_M))
         objects = self.objects, self.object_width, self.object_height
         place_objects(

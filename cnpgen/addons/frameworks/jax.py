@@ -205,6 +205,7 @@ def _loss_backward(
     _loss: PlanLoss, residual: tuple[Any, ...], by_results: tuple[jax.Array, ...]
 ) -> tuple[Any, ...]:
     total, (by_path, by_rate, by_weights), options = residual
+    # The loss of an invalid plan is nan, and its gradient 0.
     by_total = jnp.where(jnp.isfinite(total), by_results[0], 0)
     return (
         by_path * by_total[:, None, None],
@@ -228,6 +229,7 @@ def _control_points(
     )
 
     def call(*arguments: Any) -> tuple[Any, ...]:
+        # The layer computes in float64, whatever the type of the network.
         points = layer(*jax.tree.map(_wide, arguments))
         return points.path.astype(phi.dtype), points.rate.astype(phi.dtype)
 
@@ -267,6 +269,7 @@ _control_points.defvjp(_points_forward, _points_backward)
 def _on_host(
     call: Callable[..., Any], results: list[Any], *arguments: Any
 ) -> tuple[jax.Array, ...]:
+    # The callback runs in compiled functions, too, and vmap calls it once per element.
     arrays: tuple[jax.Array, ...] = jax.pure_callback(
         call, tuple(results), *arguments, vmap_method="sequential"
     )

@@ -86,6 +86,7 @@ def _records(
         if not files:
             continue
         objects = [_file(item, encoding) for item in files]
+        # Record sets refer to the set of all files of their split.
         name = f"{split}-files"
         distribution += [
             *objects,
@@ -108,6 +109,7 @@ def _records(
 def _field(field: Field, split: str, files: str) -> dict[str, Any]:
     """Describe a column of a split's files."""
     source = {"fileSet": {"@id": files}, "extract": {"column": field.name}}
+    # A width of 0 is a column of single numbers.
     shape = {"isArray": True, "arrayShape": str(field.width)} if field.width else {}
     return {
         "@type": "cr:Field",
@@ -146,6 +148,7 @@ def _variables(field: Field) -> Iterator[dict[str, Any]]:
     """Describe the components of a field, each with its unit and limits."""
     for index, (name, unit) in enumerate(zip(field.columns, field.units, strict=True)):
         limits = {"minValue": field.valid_min, "maxValue": field.valid_max}
+        # The limits of a field have one number for each component.
         yield {
             "@type": "sc:PropertyValue",
             "name": name,

@@ -83,6 +83,8 @@ def local_copy(remote: RemoteFolder, manifest: bytes, folder: Path) -> Path:
     with _one_process(folder.with_name(f"{folder.name}.lock")):
         if not (folder / MANIFEST).is_file():
             # Else another process was faster.
+            # Files are collected beside the copy, so that an interrupted download is no
+            # copy.
             unfinished = folder.with_name(f"{folder.name}.part")
             write_file(unfinished / MANIFEST, manifest)
             _download(remote, unfinished)
@@ -116,6 +118,7 @@ def _download(remote: RemoteFolder, folder: Path) -> None:
             for name, entry in manifest["files"].items()
             if name in LISTED
         ]
+        # Documents come first: the specification names the shards that are expected.
         _fetch(remote, folder, documents)
         # Only names of the specification are used, so that no path leads elsewhere.
         if not lists_shards_of(manifest, load_dataset_spec(folder)):
@@ -154,6 +157,7 @@ def _fetch(remote: RemoteFolder, folder: Path, files: Sequence[ListedFile]) -> N
                 done.result()
                 bar.update()
         finally:
+            # Transfers look at the event between two blocks.
             stop.set()
             pool.shutdown(wait=False, cancel_futures=True)
 
@@ -186,6 +190,7 @@ def _save(remote: RemoteFolder, folder: Path, stop: Event, file: ListedFile) -> 
                 f"the download of {remote.url} was interrupted at {file.name}:"
                 f" {type(error).__name__}: {error!s:.300}; the same call continues it"
             ) from error
+        # Only verified files get their final name.
         if file_sha256(beginning) == file.sha256:
             beginning.replace(path)
             return

@@ -69,6 +69,8 @@ class FileSystemFolder(RemoteFolder):
         with self._open(f"{self.path}/{name}", options) as source:
             if first:
                 source.seek(first)
+            # No more bytes than the manifest states are read, whatever the server
+            # sends.
             left = max_bytes - first
             while left > 0 and (block := source.read(min(BLOCK_BYTES, left))):
                 if stop.is_set():
@@ -103,6 +105,7 @@ def download(url: str) -> Path:
         text = f"{url:.200}: expected the URL of a folder, without a query or an anchor"
         raise UsageError(text, concerns="folder")
     remote = _open_folder(url.rstrip("/"))
+    # The dataset is at the URL itself, or in a repository of ``publish_dataset``.
     for folder in (remote, replace(remote, path=f"{remote.path}/{HDF5}")):
         if manifest := _read_manifest(folder):
             return local_copy(folder, manifest, _cache_folder(url, manifest))
@@ -141,6 +144,7 @@ def _read_manifest(folder: FileSystemFolder) -> bytes:
 
 def _cache_folder(url: str, manifest: bytes) -> Path:
     """Return the place of a copy in the cache: one for each URL and state of the dataset there."""
+    # A changed dataset at the same URL gets a folder of its own.
     place, state = (
         hashlib.sha256(content).hexdigest()[:16] for content in (url.encode(), manifest)
     )

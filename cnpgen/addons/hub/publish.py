@@ -81,6 +81,7 @@ def publish_dataset(
             argument="to",
         )
     source, target = Path(folder), Path(out)
+    # A repository inside of the dataset would be a part of what it publishes.
     if target.resolve().is_relative_to(source.resolve()):
         raise UsageError(
             f"must be a folder outside the dataset {source}, got {target}",
@@ -114,6 +115,7 @@ def write_repository(
     copies += [name for name in DOCUMENTS if name != CROISSANT]  # without record sets
     written = [path.relative_to(target).as_posix() for path in tables]
     written += [f"{HDF5}/{name}" for name in copies] + [CARD, CROISSANT, PICTURE]
+    # Files of other origin are refused before anything is written.
     claim_files(target, written, force=force)
     for task, path in zip(tasks, tables, strict=True):
         _write_table(source, spec, task, path)
@@ -142,6 +144,7 @@ def write_repository(
         target / CROISSANT,
         render(croissant_of_tables(summary, files, created=created, url=url)) + "\n",
     )
+    # The next call knows the files that this one wrote.
     record_files(target, written)
     return written
 
@@ -154,6 +157,7 @@ def _write_table(source: Path, spec: DatasetSpec, task: ShardTask, path: Path) -
 
     sha256 = load_record(source, task).sha256.encode()
     if (
+        # A table states the digest of its shard, so finished tables are kept.
         path.exists()
         and (pyarrow.parquet.read_schema(path).metadata or {}).get(SOURCE_KEY) == sha256
     ):

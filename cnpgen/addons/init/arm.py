@@ -108,6 +108,7 @@ def read_arm(urdf: Path, tip: str | None) -> Arm:
         raise RecipeError(
             [f"{urdf}: has no <link>, expected a URDF (an SRDF is given by --srdf)"]
         )
+    # Without a choice, only an unambiguous end of the robot is the tip.
     tip = tip if tip is not None else _default_tip(urdf, links, joints)
     if text := missing_frame(tree, urdf, tip):
         raise UsageError(f"--tip: {text}")
@@ -119,6 +120,7 @@ def read_arm(urdf: Path, tip: str | None) -> Arm:
             ]
         )
     planned = tuple(map(_joint, moving))
+    # The first planned joint moves all links beyond it.
     moved = tuple(link for link in links if moving[0] in _path(link, joints))
     names = {joint.name for joint in planned}
     shaped = _links_with(tree, "collision")
@@ -194,6 +196,7 @@ def _locked_positions(
         if joint.name in planned or joint.name in mimics:
             continue
         low, high = joint.limits.get("lower", 0.0), joint.limits.get("upper", 0.0)
+        # Zero, clipped to the limits; continuous joints have none.
         nearest = 0.0 if joint.kind == "continuous" else min(max(0.0, low), high)
         if nearest or joint.name in offset_of:
             positions[joint.name] = nearest
@@ -254,6 +257,7 @@ def _default_tip(urdf: Path, links: list[str], joints: Mapping[str, UrdfJoint]) 
     parents = {joint.parent for joint in joints.values()}
     ends = [link for link in links if link not in parents]
     leaves = list(dict.fromkeys(_without_fingers(link, joints) for link in ends))
+    # An end on the way to another end is no tip of its own.
     inner = {joint.parent for leaf in leaves for joint in _path(leaf, joints)}
     leaves = [leaf for leaf in leaves if leaf not in inner or len(leaves) == 1]
     if len(leaves) != 1:
@@ -290,6 +294,7 @@ def _is_impossible(inertia: LinkInertia | None) -> bool:
     """Return whether a principal inertia is negative or exceeds the sum of the others."""
     if inertia is None:
         return False
+    # Principal inertias a <= b <= c of a body meet a >= 0 and c <= a + b.
     low, medium, high = np.linalg.eigvalsh(inertia.inertia)
     return bool(
         low < -MAX_INERTIA_ERROR * high
@@ -308,6 +313,7 @@ def _joint(joint: UrdfJoint) -> ArmJoint:
         "velocity": velocity == 0,
         "torque": effort == 0,
     }
+    # Soft limits narrow the range.
     lower, upper = max(lower, joint.soft[0]), min(upper, joint.soft[1])
     half = DEFAULT_RANGE_M if joint.kind == "prismatic" else DEFAULT_RANGE_RAD
     return ArmJoint(

@@ -58,7 +58,9 @@ def comfortable_base(
         (robot.position_upper + robot.position_lower) / 2,
         (robot.position_upper - robot.position_lower) / 2,
     )
+    # 1 in the middle of all joints, 0 at a limit of one of them.
     margin = 1 - np.abs((states - centre) / half).max(axis=1)
+    # Directions in which the tip of an arm of fewer joints never moves do not count.
     moves = values.max(axis=0) > MIN_TIP_TRAVEL_M
     score = values[:, moves].prod(axis=1) * margin
     ahead = tips - robot.chain.joints[0].translation
@@ -68,12 +70,15 @@ def comfortable_base(
         & (tips[:, 2] >= 0)
     )
     free, order = _free_states(robot, states), np.argsort(-score, kind="stable")
+    # Groups of states from the best to the least demanding one.
     groups = [
         front & (load <= MAX_LOAD),
         load <= MAX_LOAD,
         load <= 1,
         np.ones(len(states), bool),
     ]
+    # Distances between links take long, so only the best states of a group are
+    # measured.
     for group in groups[:3]:
         for k in order[(group & free)[order]][:MAX_CLEARANCE_CHECKS]:
             if _clearance(world, states[k]) > MIN_LINK_CLEARANCE_M:
@@ -185,6 +190,7 @@ def _boxes(
     Flat along axes along which it does not.
     """
     aside = next((axis for axis in (1, 2, 0) if moves[axis]), 1)
+    # Half of edge and distance on either side of the center.
     shift = np.where(np.arange(3) == aside, (edge + distance) / 2 + ROUNDING_M, 0.0)
 
     def box(position: Array) -> tuple[Range, Range, Range]:

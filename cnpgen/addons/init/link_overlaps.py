@@ -112,6 +112,7 @@ def _ignore_contacts(
         gap.accepted < MIN_FREE_FRACTION * GAP_STATES
         and len(ignored) < MAX_IGNORED_PAIRS
     ):
+        # The pair that overlaps in most states blocks the most free space.
         ignored.append(max(gap.pairs, key=lambda pair: pair.parts))
         pairs = tuple((pair.first, pair.second) for pair in ignored)
         problem = replace(problem, robot=replace(problem.robot, ignored_pairs=pairs))

@@ -20,8 +20,8 @@ from cnpgen.addons.init.initial_recipes import (
     InitialProblem,
 )
 from cnpgen.addons.init.link_overlaps import MAX_PAIR_GAP, LinkOverlaps
-from cnpgen.cli.describe import link_rows, pair_rows, with_units
-from cnpgen.cli.describe_keys import GROUPS, is_array, kind_summary, part_of
+from cnpgen.addons.manual.describe import link_rows, pair_rows, with_units
+from cnpgen.addons.manual.describe_keys import GROUPS, is_array, kind_summary, part_of
 from cnpgen.cli.terminal import table
 from cnpgen.make.recipe import DatasetRecipe
 from cnpgen.problems.load_robot import load_robot

@@ -1,1 +1,1 @@
-"""The manual: the page of all commands, and completion of words in the shell. Both read the parsers."""
+"""The manual: descriptions of recipes, kinds and keys, pages from the code, and completion of words in the shell."""

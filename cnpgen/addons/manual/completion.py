@@ -8,7 +8,7 @@ import re
 from collections.abc import Iterator
 from functools import partial
 
-from cnpgen.cli.list_command import names
+from cnpgen.addons.manual.list_command import names
 from cnpgen.cli.parser import Commands, Parser
 from cnpgen.errors import requires_extra
 

@@ -3,7 +3,7 @@
 import re
 from collections.abc import Iterator
 
-from cnpgen.cli.describe_keys import (
+from cnpgen.addons.manual.describe_keys import (
     GROUPS,
     default_text,
     expected_text,

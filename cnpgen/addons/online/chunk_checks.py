@@ -61,10 +61,12 @@ class ChunkChecks:
     def __init__(
         self, problem: Problem, robot: Robot, *, length: int, rate: float, noise: float
     ) -> None:
+        # Positions beyond the limits are clipped later, so they refuse no chunk.
         speeds = tuple(c for c in problem.constraint if type(c) is not JointPosition)
         limited = replace(problem, constraint=speeds)
         world = PathWorld(robot, problem.obstacle, problem.object_size)
         self._limits = joint_limits(limited, world)
+        # Times of a chunk are nominal, without jitter.
         self._errors = SampleErrors(noise, 0.0, 0.0, 0.0, "")
         self._times = np.arange(length) / rate
         self._n, self._columns = robot.n, 0
@@ -136,6 +138,7 @@ def check_rest(
         joint = int(np.argmax(outside))
         text = f"{names[joint]} is {outside[joint]:.3g} rad outside its position limits"
         raise UsageError(text, concerns="measured")
+    # Measured velocities of an arm at rest are noise, not zero.
     resting = np.abs(dq) <= MAX_RESTING_SPEED * robot.velocity_limit
     if not resting.all():
         # Nan does not rest.
@@ -160,6 +163,7 @@ def horizon(stop_after: float | None, length: int, rate: float) -> int:
     """Return the number of samples that a motion follows, so that it rests after a time [s]."""
     if stop_after is None:
         return length
+    # The motion takes at most MAX_DURATION times the samples that it follows.
     samples = int(stop_after / MAX_DURATION * rate + SAMPLE_ROUNDING) + 1
     if samples < MIN_CHUNK_SAMPLES:
         least = MAX_DURATION * (MIN_CHUNK_SAMPLES - 1) / rate

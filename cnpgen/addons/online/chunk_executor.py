@@ -118,9 +118,11 @@ class ChunkExecutor:
         )
         self._motions = ChunkMotions(self._record, self._rate, max_speed)
         # Numbers of samples that delays leave, one of each parametrization of motions.
+        # Samples that pass between the observation and the join, at the largest speed.
         delay = (self._stale_after + self._join) * max_speed
         skipped = min(int(delay * self._rate) + 1, self._length - MIN_CHUNK_SAMPLES)
         left = range(self._length - skipped, self._length + 1)
+        # Samples beyond the horizon are not followed.
         used = [min(samples, self._horizon) for samples in left]
         self._lengths = self._motions.prepare(used)
         self._lock = threading.RLock()
@@ -161,6 +163,7 @@ class ChunkExecutor:
                         f"the arm needs {left:.3g} s more of set points to stop"
                     )
                 self._runtime.resume(q)
+            # Observations before the reset show an arm that was moved since.
             self._observed = self._clock.last(self._runtime.now)
             self._latched = None
 
@@ -238,11 +241,13 @@ class ChunkExecutor:
         runtime, inner = self._read_clock(now, is_step=True)
         if self._latched is None:
             cause = self._age(now, observed) or self._mismatch(runtime, inner, state)
+            # A refused observation counts as seen, so that it cannot be sent again.
             self._observed = max(observed, self._observed)
             if cause is not None:
                 self._latch(cause)
         if self._latched is not None:
             return self._refusal(self._latched, inner)
+        # Both clocks differ by a constant, so the age of the observation is kept.
         times = inner, inner - now + observed
         return self._join_chunk(runtime, q, others, times=times, stops=stops)
 
@@ -263,6 +268,7 @@ class ChunkExecutor:
         now, observed = times
         if not (np.isfinite(q).all() and np.isfinite(others).all()):
             return self._refusal(SwitchOutcome.NOT_FINITE, now)
+        # The first finite chunk defines the number of columns.
         self._checks.keep_columns(q.shape[1] + others.shape[1])
         if (np.abs(q) > MAX_POSITION).any():
             detail = f"a position above {MAX_POSITION:g}"
@@ -273,6 +279,7 @@ class ChunkExecutor:
         if self._length - skipped < MIN_CHUNK_SAMPLES:
             detail = f"{max(self._length - skipped, 0)}, expected at least {MIN_CHUNK_SAMPLES}"
             return self._refusal(SwitchOutcome.SHORT, at, detail)
+        # Samples that are due before the join have passed.
         used = slice(skipped, skipped + self._horizon)
         motion = self._motions.motion(q[used], others[used], runtime.state_at(at))
         distance = motion.distance
@@ -290,8 +297,12 @@ class ChunkExecutor:
         stops: int | None,
     ) -> ChunkJoin:
         """Switch to the fastest speed that is valid, or to the chunk's own timing."""
+        # A grid decides the speed, the verdict decides its use: the chunk's own timing
+        # is tried last.
         for index in dict.fromkeys((self._motions.fastest(motion), 0)):
             plan, speed = motion.at_speed(index)
+            # The chunk is added before the switch, since its set points may be served
+            # at once.
             executed = self._progress.executed(motion, plan, join.time)
             self._progress.add(executed)
             switch = runtime.switch(plan, join.time, stops=stops)
@@ -320,6 +331,8 @@ class ChunkExecutor:
         )
         self._progress = ChunkProgress(runtime)
         for length in self._lengths:
+            # Only the parametrization matters here, so every chunk rests at the present
+            # positions.
             samples = np.tile(q, (length, 1))
             still = self._motions.motion(samples, samples[:, :0], runtime.state_at(0.0))
             runtime.switch(still.at_speed(self._motions.fastest(still))[0], 0.0)
@@ -343,6 +356,7 @@ class ChunkExecutor:
     def _latch(self, cause: SwitchOutcome, *, in_background: bool = False) -> None:
         """Stop the runtime and refuse chunks; the first cause is kept."""
         runtime = self._checked_runtime()
+        # Two threads may find causes at once.
         with self._lock:
             if self._latched is not None:
                 return
@@ -356,6 +370,7 @@ class ChunkExecutor:
 
     def _age(self, now: float, observed: float) -> SwitchOutcome | None:
         """Return why the observation of a chunk is too old or not new; None if it is neither."""
+        # An observation of the future belongs to another clock.
         if observed > now + ROUNDING_S:
             return SwitchOutcome.CLOCK
         if now - observed > self._stale_after:
@@ -367,6 +382,7 @@ class ChunkExecutor:
         self, runtime: PlanRuntime, time: float, measured: tuple[Array, Array]
     ) -> SwitchOutcome | None:
         """Return TRACKING if a measured state is too far from the set point or too fast; None otherwise."""
+        # The arm is compared with the set point of the same time.
         error = np.abs(measured[0] - runtime.state_at(time).q)
         speed = np.abs(measured[1]) / self._robot.velocity_limit
         follows = (error <= self._tracking_error) & (speed <= MAX_MEASURED_SPEED)

@@ -74,12 +74,16 @@ class ChunkFit:
 
     def running_speed(self, q: Array, state: SetPoint, max_speed: float) -> float:
         """Return u at the join: the component of the running velocity along the chunk, in its own speeds."""
+        # The component of dq along the chunk's velocity v, in units of v: dq v / v^2.
+        # The least square keeps it finite at rest.
         velocity = self.first[1] @ q[: self.first.shape[1]]
         along = float(state.dq @ velocity) / max(float(velocity @ velocity), MIN_SPEED2)
         return min(max(along, MIN_RUNNING_SPEED), max_speed)
 
     def rate(self, running: float, speed: Array) -> Array:
         """Return the rates of motions from a running speed to M speeds [1/s], shape (M, R)."""
+        # Every control point of the rate moves from the running to the final speed by
+        # its share.
         u = running + (speed[:, None] - running) * self.ramp
         return np.asarray(u / self.duration)
 
@@ -88,6 +92,7 @@ class ChunkFit:
 
         In chunk time the running motion has velocity dq / u and acceleration ddq / u^2.
         """
+        # State of the chunk at its first sample, by a least-squares parabola.
         own = self.first @ q[: self.first.shape[1]]
         running_state = np.stack([state.q, state.dq / running, state.ddq / running**2])
         return np.asarray(q + self.decay @ (running_state - own))
@@ -100,14 +105,19 @@ class ChunkFit:
         Returns:
             Boundary conditions and path control points, shape (C, n).
         """
+        # The end of the parabola through the last samples lowers their noise.
         goal = self.last @ q[-len(self.last) :]
         still = np.zeros_like(goal)
         boundary = Boundary(*(x[None] for x in (*state, goal, still, still)))
         free = self.spec.path_control_points - 2 * FIXED_POINTS
+        # Position, velocity and acceleration at both ends fix three control points
+        # each.
         path = assemble(
             boundary, np.zeros((1, free, len(goal))), rate[None], self.spec
         )[0]
         ends = np.concatenate([path[:FIXED_POINTS], path[-FIXED_POINTS:]])
+        # Least squares of the free points: A_free x = y - A_fixed x_fixed, with zero
+        # jerk as target.
         target = -self.fixed @ ends
         target[: self.length] += q
         path[FIXED_POINTS:-FIXED_POINTS] = self.solve @ target
@@ -118,6 +128,7 @@ class ChunkFit:
 def chunk_fit(length: int, rate: float) -> ChunkFit:
     """Compute the matrices of chunks of K samples at a rate [Hz]."""
     step = 1 / rate
+    # D = (K - 1) h / (1 - b / 2), of the module.
     duration = (length - 1) * step / (1 - BRAKING_SHARE / 2)
     points = int(
         np.clip(round(length / SAMPLES_PER_POINT), MIN_PATH_POINTS, MAX_PATH_POINTS)
@@ -126,6 +137,7 @@ def chunk_fit(length: int, rate: float) -> ChunkFit:
         degree=CHUNK_DEGREE, path_control_points=points, rate_control_points=RATE_POINTS
     )
     fine = np.linspace(0, 1, 4001)
+    # The inverse of x(s) on a fine table gives the phases of the samples.
     phases = np.interp(np.arange(length) * step, chunk_times(fine, duration), fine)
     # Jerks are p''' / D^3, and their mean square over 4 C phases is the penalty.
     inner = np.linspace(0, 1, 4 * points)
@@ -149,8 +161,11 @@ def chunk_fit(length: int, rate: float) -> ChunkFit:
         duration,
         phases,
         chunk_times(np.linspace(0, 1, PHASES), duration),
+        # The pseudo-inverse is computed once for all chunks of this length.
         np.linalg.pinv(np.delete(rows, ends, axis=1)),
         rows[:, ends],
+        # Parabola q + v x + a x^2 / 2 at the first sample, and its value at the last
+        # one.
         np.linalg.pinv(np.stack([x**0, x, x**2 / 2], axis=1)),
         np.linalg.pinv(np.stack([x**0, x - x[-1], (x - x[-1]) ** 2], axis=1))[0],
         _decay(length, step),
@@ -173,6 +188,8 @@ def _decay(length: int, step: float) -> Array:
     samples = min(BLEND_SAMPLES, length - 1)
     span = samples * step
     u = np.minimum(np.arange(length) / samples, 1.0)
+    # Every blend ends with zero value, velocity and acceleration: a factor of (1 -
+    # u)^3.
     rest = (1 - u) ** 3
     return np.stack(
         [

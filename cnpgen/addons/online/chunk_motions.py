@@ -61,6 +61,7 @@ class ChunkMotions:
             self._violation = loaded.kernels.load(speed_violation)
             self._orders, robot = loaded.problem.path_orders, loaded.robot
         self._grids: dict[TrajectorySpec, PhaseGrid] = {}
+        # Joints with less than two insets of range keep their middle.
         middle = (robot.position_lower + robot.position_upper) / 2
         self._low = np.minimum(robot.position_lower + POSITION_INSET_RAD, middle)
         self._high = np.maximum(robot.position_upper - POSITION_INSET_RAD, middle)
@@ -79,6 +80,7 @@ class ChunkMotions:
         """Fit a motion from a state to samples, shape (K, n), after clipping them to the position limits."""
         fit = chunk_fit(len(q), self._rate)
         inside = np.clip(q, self._low, self._high)
+        # The path depends on the running speed alone, so all speeds share it.
         running = fit.running_speed(inside, state, float(self._speeds[-1]))
         rates = fit.rate(running, self._speeds)
         samples = fit.blended(inside, state, running)
@@ -93,6 +95,8 @@ class ChunkMotions:
             degree=fit.spec.degree,
             source="action chunk",
         )
+        # The distance is that from the raw samples, which clipping and blending may
+        # change.
         reached = basis(fit.phases, len(path), fit.spec.degree) @ path
         return ChunkMotion(fit, plan, rates, float(np.abs(reached - q).max()), others)
 
@@ -101,6 +105,7 @@ class ChunkMotions:
         if (count := len(motion.rates)) == 1:
             return 0
         path = motion.plan.path_control_points
+        # Every speed is one motion, evaluated with the others in one call.
         motions = Motion(
             np.repeat(path, count, axis=0), motion.rates, motion.plan.degree
         )
@@ -114,6 +119,7 @@ class ChunkMotions:
     def _grid(self, spec: TrajectorySpec) -> PhaseGrid:
         """Return the phases at which splines of a kind are compared with the limits; it is kept."""
         if (grid := self._grids.get(spec)) is None:
+            # Chebyshev phases are denser near both ends.
             s, degree = chebyshev(SPEED_CHECK_INTERVALS), spec.degree
             path, rate = (
                 np.stack([basis(s, points, degree, order) for order in range(orders)])

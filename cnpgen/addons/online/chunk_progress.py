@@ -44,6 +44,7 @@ class ExecutedChunk:
 
     def others_at(self, time: float) -> Array:
         """Return the other columns of the last sample that is reached at a time since the join [s], shape (D - n,)."""
+        # Rounded down: other columns never lead the joints.
         sample = int(self.chunk_time(time) / self.step + SAMPLE_ROUNDING)
         return np.asarray(self.others[min(sample, len(self.others) - 1)])
 
@@ -62,6 +63,7 @@ class ChunkProgress:
     def executed(self, motion: ChunkMotion, plan: Plans, at: float) -> ExecutedChunk:
         """Return the chunk of a motion that joins at a time [s] with a plan of one of its speeds."""
         fit, s = motion.fit, np.linspace(0, 1, len(motion.fit.times))
+        # Equal phases connect the time of the motion with the chunk time.
         times = plan.motion.time_at(s)[0]
         before = self.at(at)
         return ExecutedChunk(
@@ -95,15 +97,18 @@ class ChunkProgress:
         sample, the result is the earliest time and the nearest sample.
         """
         before = self.at(observed)
+        # Samples that the arm has passed at the join, since the observation.
         due = (self.at(earliest) - before) * rate
         sample = int(np.ceil(due - SAMPLE_ROUNDING))
         chunk, since = self._chunk_at(earliest)
         if chunk is None:
             return earliest, 0
+        # Chunk time of the sample within the running chunk.
         target = before + sample / rate - chunk.progress
         if target >= chunk.chunk_times[-1]:
             return earliest, round(due)
         reached = float(np.interp(target, chunk.chunk_times, chunk.times))
+        # A sample that is due already is followed at once.
         return earliest + max(reached - since, 0.0), sample
 
     def _chunk_at(self, time: float) -> tuple[ExecutedChunk | None, float]:
@@ -112,6 +117,7 @@ class ChunkProgress:
         At rest it is the end of the last chunk before.
         """
         plan, since = self._runtime.plan_at(time)
+        # The latest chunk of a plan counts.
         for chunk in reversed(self._chunks):
             if chunk.plan is plan:
                 return chunk, since

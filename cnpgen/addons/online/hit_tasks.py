@@ -57,6 +57,7 @@ def load_completion(model: Model, backend: str | None) -> Completion:
     name = str(model.training.get("dataset", {}).get("name", model.problem.name))
     with loaded_problem(model.problem, backend) as loaded:
         context = Context(loaded.problem, loaded.robot, loaded.kernels)
+        # Parameters are a column only if the problem has some.
         given = (
             (*HIT_COLUMNS, "parameters") if loaded.problem.parameters else HIT_COLUMNS
         )
@@ -101,6 +102,7 @@ def hit_tasks(
         check_units_of_states(completion.context.robot, states, noun="hit")
     centre, goal = lanes("puck", puck, {2, 3}), lanes("target", target, {2})
     direction = goal - centre[:2]
+    # Equal positions have no direction.
     if not np.count_nonzero(direction, axis=0).all():
         raise UsageError(
             f"must differ from the puck's position, got {goal.T.tolist()} for both",
@@ -111,6 +113,7 @@ def hit_tasks(
         "speed_share", np.reshape(numbers("speed_share", share), (-1, 1)), {1}
     )
     _check_distance(completion, contact_distance, {"puck": centre, "target": goal})
+    # The goal of the mallet is behind the puck, seen from the target.
     columns = dict(
         zip(
             HIT_COLUMNS,

@@ -54,6 +54,7 @@ class KeptStops:
         """Return the kept stop of a motion that begins first after a time [s], and its begin; None without one."""
         with self._lock:
             stops = self._stops if motion is self._motion else []
+            # A stop may be used at all times before it begins.
             return next((kept for kept in stops if kept[0] >= time), None)
 
     def _keep(self, motion: SampledMotion) -> None:
@@ -61,9 +62,11 @@ class KeptStops:
         for begin in np.arange(
             motion.start, motion.end_time, KEPT_STOP_STEP_S
         ).tolist():
+            # A stop that is needed now has priority (``paused``).
             self._may_compute.wait()
             stop = earliest_stop(self._checker, motion, begin, measured=self._measured)
             with self._lock:
+                # Another motion was followed meanwhile: its own thread computes now.
                 if self._motion is not motion:
                     return
                 self._stops.append((begin, stop))

@@ -54,6 +54,7 @@ class MotionChecker:
         self, part: Plans, motion: SampledMotion, times: Array, phases: Array
     ) -> str:
         q, dq, ddq = (values.T for values in motion.at(times))
+        # Values that overflow are inf or nan, which violate.
         with self._lock, np.errstate(all="ignore"):
             problem, world = self._open(part)
             start_tip = self._start_tip(world, part)
@@ -98,10 +99,12 @@ def passed_parts(
     """
     if motion.plan is None:
         return
+    # The motion is at the place that the plan passes at these times.
     plan_times = np.interp(times, motion.edges, motion.plan_times)
     parts = parts_of(motion.plan)
     index = np.searchsorted([begin for _, begin, _ in parts], plan_times, side="right")
     for number, (part, begin, _) in enumerate(parts, 1):
+        # A time before the first part, by rounding, belongs to it.
         mask = np.maximum(index, 1) == number
         if mask.any():
             yield part, mask, part.motion.phase_at(plan_times[mask] - begin)[0]
@@ -109,6 +112,7 @@ def passed_parts(
 
 def _jerks(motion: SampledMotion, times: Array) -> Array:
     """Compute the jerks of a motion [rad/s^3], shape (n, K), within its duration."""
+    # Times are shifted inward at the ends, so that all of them are within the motion.
     low = np.clip(times - JERK_STEP_S, motion.start, motion.end_time - 3 * JERK_STEP_S)
     before, after = (motion.at(low + k * JERK_STEP_S).ddq for k in (0, 2))
     return np.asarray((after - before).T / (2 * JERK_STEP_S))

@@ -106,6 +106,7 @@ class PuckModel:
             Positions and velocities at these times, shape (N, 2) each.
         """
         # The path over the velocity that a puck still covers [s].
+        # With dv/dt = -k v, a puck covers v (1 - exp(-k t)) / k within t.
         left = (
             np.array(time, np.float64)
             if self.drag == 0
@@ -118,22 +119,29 @@ class PuckModel:
         )
         for _ in range(MAX_BOUNCES):
             with np.errstate(divide="ignore", invalid="ignore"):
+                # The side band or the home band that each coordinate moves to, if there
+                # is one.
                 bound = np.where(velocity > 0, high, low)
                 share = np.where(
                     velocity == 0,
                     np.inf,
                     np.maximum((bound - position) / velocity, 0.0),
                 )
+            # The first of both bands that the puck reaches.
             axis = np.argmin(share, axis=1)
             rows = np.arange(len(share))
             bounces = share[rows, axis] < left
             step = np.where(bounces, share[rows, axis], left)
             position += velocity * step[:, None]
+            # The velocity falls linearly along the path: v - k x.
             decay = 1 - self.drag * step
             velocity *= decay[:, None]
+            # The rest of the path, over the velocity that is left.
             left = (left - step) / decay
             if not bounces.any():
                 break
+            # A bounce reverses the normal part by the restitution and reduces the
+            # tangential one.
             factors = np.full(velocity.shape, 1 - self.band_loss)
             factors[rows, axis] = -self.band_restitution
             velocity = np.where(bounces[:, None], velocity * factors, velocity)
@@ -150,10 +158,15 @@ class PuckModel:
             normal: Unit vectors from the mallet's centre to the puck's, shape (N, 2).
         """
         relative = mallet_velocity - velocity
+        # Discs that separate have no contact.
         approach = np.maximum(np.sum(relative * normal, axis=1), 0.0)
         tangent = np.stack([-normal[:, 1], normal[:, 0]], axis=1)
         sliding = np.sum(relative * tangent, axis=1)
+        # Momentum over the mass of the puck, as the mallet is much heavier: (1 + e)
+        # v_n.
         impulse = (1 + self.restitution) * approach
+        # Friction reduces sliding at most to rolling, and by no more than mu times the
+        # normal impulse.
         dragged = np.clip(
             ROLLING_SHARE * sliding, -self.friction * impulse, self.friction * impulse
         )
@@ -175,8 +188,10 @@ class PuckModel:
         angle = wanted.copy()
         for _ in range(ANGLE_ITERATIONS):
             normal = np.stack([np.cos(angle), np.sin(angle)], axis=1)
+            # The mallet moves along the normal and adds no tangential velocity itself.
             after = self.velocity_after(velocity, speed[:, None] * normal, normal)
             error = np.arctan2(after[:, 1], after[:, 0]) - wanted
+            # The angle is corrected by the error, wrapped to [-pi, pi).
             angle -= (error + np.pi) % (2 * np.pi) - np.pi
         return angle
 
@@ -227,6 +242,7 @@ class MovingHits:
             MAX_PUCK_SPEED_M_S,
             "m/s",
         )
+        # One value of an argument holds for all hits.
         size = max(len(values) for values in parts.values())
         for name, values in parts.items():
             if len(values) not in {1, size}:
@@ -303,10 +319,13 @@ def plan_moving_hits(
             active,
             columns,
         )
+        # The mallet covers the overlap after the contact, at about its final speed.
         contact = plans.duration - hits.overlap / speed[active]
+        # Fixed point: the contact time of the plan is the next meeting time.
         change, last = np.abs(contact - time[active]), time[active]
         if hits.waits or not len(active) or (change <= MAX_MEETING_ERROR_S).all():
             break
+        # Hits that have converged keep their time, so that their plans stay.
         time[active] = np.where(change <= MAX_MEETING_ERROR_S, last, contact)
     if not hits.waits:
         delay, accepted, reason = (
@@ -315,6 +334,7 @@ def plan_moving_hits(
             NO_MEETING,
         )
     else:
+        # The arm waits until the plan meets the puck at the stated time.
         delay, reason = hits.meeting_time[active] - contact, TOO_LATE
         accepted = delay >= 0
     reasons[active[~accepted]] = reason
@@ -337,6 +357,7 @@ def _touched_early(
     """Return whether moving pucks touch the mallet before the meeting, while it waits (if not negative) or moves."""
     if not len(plans):
         return np.zeros(0, bool)
+    # The row of a plan is that of its hit.
     phases, rows, speed = (
         np.linspace(0, 1, EARLY_CONTACT_PHASES),
         plans.sample_id,
@@ -349,14 +370,17 @@ def _touched_early(
     moving = completion.tip_positions(q.reshape(-1, q.shape[2]).T)[:2].T.reshape(
         *q.shape[:2], 2
     )
+    # Plans begin after the waiting time.
     start = np.maximum(delay, 0.0)[:, None]
     times = start + plans.motion.time_at(phases)
+    # The last part of the path, and a margin before it, are the contact itself.
     before = (
         times
         <= times[:, -1:] - (hits.overlap + EARLY_CONTACT_MARGIN_M) / speed[:, None]
     )
     parts = [(moving, times, before)]
     if start.any():
+        # While it waits, the mallet rests at its start.
         parts.append(
             (
                 np.repeat(moving[:, :1], len(phases), axis=1),
@@ -370,6 +394,7 @@ def _touched_early(
             np.repeat(values[rows], len(phases), axis=0)
             for values in (hits.puck, hits.velocity)
         )
+        # In the frame of the mallet, the puck passes the origin along segments.
         relative = (
             hits.model.predict(puck, velocity, time.ravel())[0].reshape(mallet.shape)
             - mallet

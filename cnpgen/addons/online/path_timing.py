@@ -83,10 +83,12 @@ class PathLimits:
         Starts and durations [s] have shape (N,), shapes are indices of ``shape_table``.
         """
         speed, brake, travel = (table[shapes] for table in shape_table())
+        # Place on the path that each law has reached at its phases.
         sigma = start[:, None] + duration[:, None] * travel
         position = (sigma - self.times[0]) / (self.times[1] - self.times[0])
         node = np.clip(position.astype(int), 0, len(self.times) - 2)
         share = np.clip(position - node, 0.0, 1.0)[..., None]
+        # The tables have w times the duration.
         u2, w = (speed**2)[..., None], (brake / duration[:, None])[..., None]
         # The value is linear in each of the tables, so the two nodes are compared.
         low, high = (
@@ -121,6 +123,7 @@ def shape_at(x: Array, rise: float, fall: float) -> tuple[Array, Array, Array]:
     (1 - x) / fall); u = 1 - integral of w T; sigma / T = integral of u.
     """
     height = 1 / (1 - (rise + fall) / 2)
+    # A trapezoid of area 1: the speed falls by one.
     brake = height * np.minimum(np.minimum(x / rise, (1 - x) / fall), 1.0)
     # Integrals of the ramps (x - e)+ that w T consists of: its gradient changes at e.
     edges, gradients = (0.0, rise, 1 - fall), (1 / rise, -1 / rise, -1 / fall)
@@ -141,6 +144,7 @@ def path_limits(
     motion there.
     """
     assert motion.plan is not None
+    # At least three nodes, also for a short remainder of the motion.
     times = np.linspace(first, last, max(3, int((last - first) / NODE_STEP_S) + 2))
     # At its end a sampled motion is at rest: the state before is that of its last cell.
     states = motion.at(np.minimum(times, np.nextafter(motion.end_time, -np.inf)))
@@ -150,6 +154,8 @@ def path_limits(
     rest, square, brake_factor, limit = (
         np.concatenate(x) for x in zip(*terms, strict=True)
     )
+    # The motion itself is valid within tolerances: braking must not be refused for
+    # them.
     limit = np.maximum(
         MAX_BRAKING_USE * limit, np.abs(rest + square) * (1 + TIMING_ROUNDING)
     )
@@ -167,8 +173,12 @@ def _terms(
         limit = _acceleration_factor(part, robot) * robot.acceleration_limit
         quantities.append((still, ddq, dq, np.broadcast_to(limit, q.shape)))
     if problem.first(JointTorque) is not None:
+        # Inverse dynamics at rest are the torques of gravity.
         gravity = checker.torques(part, q, still, still)
+        # With dq = 0 and ddq = q', they are M q' + gravity.
         brake_factor = checker.torques(part, q, still, dq) - gravity
+        # With u = 1 and w = 0, they are those of the motion: M q'' + n(q, q') +
+        # gravity.
         square = checker.torques(part, q, dq, ddq) - gravity
         limit = np.broadcast_to(robot.torque_limit, q.shape)
         quantities.append((gravity, square, brake_factor, limit))
@@ -176,6 +186,7 @@ def _terms(
             # Friction of either direction reduces the limit: its sum would not be linear.
             friction = np.max(np.abs(friction_bounds(drive, dq.T)), axis=0).T
             left = drive.torque_limit - np.maximum(friction, drive.resting_friction)
+            # Rotors add armature times ddq, which has the same form q'' u^2 - q' w.
             rotors = square + drive.armature * ddq, brake_factor + drive.armature * dq
             quantities.append((gravity, *rotors, left))
     if not quantities:
@@ -204,6 +215,7 @@ def retimed(motion: SampledMotion, law: TimeLaw) -> SampledMotion:
     times = grid(law.duration)
     u, brake, travel = shape_at(times / law.duration, law.rise, law.fall)
     sigma = law.start + law.duration * travel
+    # A law may end where the path ends.
     if sigma[-1] >= motion.end_time - TIMING_ROUNDING:
         # A slower end stops with the path.
         sigma = np.minimum(sigma, np.nextafter(motion.end_time, -np.inf))
@@ -211,6 +223,7 @@ def retimed(motion: SampledMotion, law: TimeLaw) -> SampledMotion:
     u[-1] = brake[-1] = 0.0  # exactly at rest
     u, w = u[:, None], brake[:, None] / law.duration
     states = SetPoint(q, dq * u, ddq * u**2 - dq * w)
+    # Slower times keep the place on the path of the plan.
     plan_times = np.interp(sigma, motion.edges, motion.plan_times)
     slower = sample_states(law.start + times, states, motion.plan, plan_times)
     return joined_motions(motion, slower) if law.start > motion.start else slower

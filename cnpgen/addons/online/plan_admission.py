@@ -118,6 +118,7 @@ class Admission:
         parts: tuple[Any, ...] = (
             plan.parts if isinstance(plan, JoinedPlans) else (plan,)
         )
+        # A sequence carries one load, which is that of the runtime.
         for part in parts:
             own, expected = part.boundary.parameters, self._parameters
             if (
@@ -130,6 +131,7 @@ class Admission:
                     f"its parameters are {own[0]}, those of the runtime {expected}",
                 )
         duration = plan.duration
+        # An endless motion cannot be sampled on a grid.
         if not np.isfinite(duration).all():
             return SwitchOutcome.INVALID, "its duration is not finite"
         speed = np.abs(end.dq)
@@ -160,6 +162,7 @@ class Admission:
             SetPoint._fields, before, after, limits, MAX_SWITCH_GAPS, strict=True
         ):
             gap = np.abs(begin[0] - end)
+            # The negation refuses nan, too.
             if not (gap <= share * limit).all():
                 return f"{name} jumps by {gap.max():.3g}"
         return ""

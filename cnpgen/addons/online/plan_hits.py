@@ -258,12 +258,15 @@ def _first_valid(
 ) -> PlannedHits:
     """Plan hits with ways back at the first speed of each at which both motions are valid."""
     first, *slower = RETURNING_SPEED_SHARES
+    # All hits begin with the highest speed share.
     hits, judge = plan(first), Judge(*open_problem(as_record(planner.model.problem)))
     shares = np.full(len(hits.reasons), first)
     for share in slower:
         invalid = ~(_valid(judge, hits.plans) & _valid(judge, hits.return_plans))
         if not invalid.any():
             break
+        # Only hits that are not valid become slower; the others are planned again
+        # unchanged.
         shares[hits.plans.sample_id[invalid]] = share
         hits = plan(shares)
     return hits

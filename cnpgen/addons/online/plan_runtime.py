@@ -280,9 +280,11 @@ class PlanRuntime:
             with self._lock:
                 # Refuses all plans of earlier requests.
                 self._stops += 1
+                # A second stop returns the result of the first one.
                 if self._stop is not None:
                     return self._stop
                 begin = max(at, self._timeline.now)
+                # Plans are refused from here on, also while the stop is computed.
                 self._stop = _report(self._timeline.part_at(begin), begin)
                 dropped = self._timeline.drop_after(begin)
             self._requests.refuse_waiting(SwitchOutcome.STOPPED)
@@ -317,12 +319,15 @@ class PlanRuntime:
 
     def _stop_on_path(self, begin: float, dropped: list[float]) -> Stop:
         """Compute a stop and follow it, or a kept one if it comes too late."""
+        # The begin of a stop may pass while the stop is computed.
         for _ in range(MAX_LATE_STOPS):
             motion = self._timeline.part_at(begin)
             with self._kept_stops.paused():
                 stop = earliest_stop(self._checker, motion, begin, measured=self._judge)
             with self._lock:
                 now = self._timeline.now
+                # Set points after the begin have been served, so only a later stop can
+                # be used.
                 if now > begin:
                     kept = self._kept_stops.after(motion, now)
                     if kept is None:
@@ -348,8 +353,10 @@ class PlanRuntime:
         if isinstance(motion, SwitchOutcome):
             return Switch(motion, at, detail)
         with self._lock:
+            # The clock and the stops may have changed while the plan was judged.
             if refusal := self._refusal(at, stops):
                 return Switch(refusal, at)
+            # The state at the switch is that of the motion in execution now.
             before = self._timeline.state_at(np.array(at))
             if jump := self._admission.jump(before, motion):
                 return Switch(SwitchOutcome.JUMP, at, jump)
@@ -382,6 +389,7 @@ def _report(motion: SampledMotion, begin: float, detail: str = "") -> Stop:
     """Return the result of a stop that begins at a time of a motion [s]."""
     end = max(begin, motion.end_time)
     times = np.linspace(begin, end, REPORT_SAMPLES)
+    # Sums of absolute steps: a joint may reverse while the arm stops.
     distance = np.abs(np.diff(motion.at(times).q, axis=0)).sum(axis=0)
     return Stop(SwitchOutcome.ACCEPTED, begin, detail, end, distance)
 

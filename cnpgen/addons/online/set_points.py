@@ -90,11 +90,13 @@ class SampledMotion:
         width = (self.edges[cell + 1] - low)[:, None]
         x = (times - low)[:, None] / width
         c = self.coefficients[cell].transpose(1, 0, 2)
+        # Horner's scheme; derivatives by x are divided by powers of the width.
         q = ((((c[5] * x + c[4]) * x + c[3]) * x + c[2]) * x + c[1]) * x + c[0]
         dq = (
             (((5 * c[5] * x + 4 * c[4]) * x + 3 * c[3]) * x + 2 * c[2]) * x + c[1]
         ) / width
         ddq = (((20 * c[5] * x + 12 * c[4]) * x + 6 * c[3]) * x + 2 * c[2]) / width**2
+        # After its end, the arm rests exactly, in spite of rounding of the polynomial.
         over = (times >= self.end_time)[:, None]
         return SetPoint(
             np.where(over, self.end, q),
@@ -117,6 +119,7 @@ def sample_motion(
         coefficients.append(
             _cells(times, SetPoint(states.q[0], states.dq[0], states.ddq[0]))
         )
+        # The last edge of a part is the first of the next one.
         edges.append(begin + times[:-1])
         last = states.q[0, -1]
     plan_times = np.append(np.concatenate(edges), float(plan.duration[0]))
@@ -165,6 +168,7 @@ def joined_motions(first: SampledMotion, second: SampledMotion) -> SampledMotion
 def _cells(times: Array, states: SetPoint) -> Array:
     """Return the quintic Hermite polynomials between states at times, shape (K - 1, 6, n)."""
     width = np.diff(times)[:, None]
+    # With x = (t - t_k) / w, derivatives by x are w dq and w^2 ddq.
     ends = [
         np.stack([q, dq * width, ddq * width**2], axis=1)
         for q, dq, ddq in (
@@ -178,6 +182,7 @@ def _cells(times: Array, states: SetPoint) -> Array:
 def at_rest(q: ArrayLike, start: float) -> SampledMotion:
     """Return an arm at rest at joint positions [rad], shape (n,), from a time on [s]."""
     end = np.array(q, np.float64)
+    # A constant polynomial in one cell; times after it are at rest.
     coefficients = np.zeros((1, 6, len(end)))
     coefficients[0, 0] = end
     edges = start + np.array([0.0, MAX_GRID_STEP_S])

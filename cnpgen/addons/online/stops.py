@@ -40,6 +40,7 @@ def earliest_stop(
     left = motion.end_time - time
     if motion.plan is None or left <= MIN_BRAKING_TIME_S:
         return motion
+    # Stops longer than this are not searched; the motion ends by itself.
     horizon = min(left, MAX_BRAKING_TIME_S)
     limits = path_limits(checker, motion, time, time + horizon)
     best = _earliest_law(limits, time, horizon)
@@ -57,20 +58,24 @@ def _earliest_law(limits: PathLimits, time: float, horizon: float) -> TimeLaw | 
     duration. Longer ones are feasible, too, except where the path becomes harder.
     """
     count = len(shapes())
+    # All combinations of delays and shapes are evaluated together.
     shape = np.tile(np.arange(count, dtype=np.int64), len(DELAYS_S))
     delay = np.repeat(DELAYS_S, count)
     high = horizon - delay
     possible = high > MIN_BRAKING_TIME_S
     shape, delay, high = shape[possible], delay[possible], high[possible]
+    # The longest duration counts as found, if it is feasible.
     feasible = limits.feasible(time + delay, high, shape)
     low = np.full_like(high, MIN_BRAKING_TIME_S)
     for _ in range(BISECTIONS):
         midpoint = (low + high) / 2
         shorter = limits.feasible(time + delay, midpoint, shape)
         feasible |= shorter
+        # High ends stay feasible, low ends are not.
         low, high = np.where(shorter, low, midpoint), np.where(shorter, midpoint, high)
     if not feasible.any():
         return None
+    # The law that ends first wins, whatever its delay.
     best = int(np.argmin(np.where(feasible, delay + high, np.inf)))
     return TimeLaw(time + delay[best], float(high[best]), *shapes()[shape[best]])
 
@@ -98,11 +103,13 @@ def with_smooth_end(
     duration = np.repeat(SMOOTH_END_TIMES_S, len(travel))
     shape = np.tile(np.arange(len(travel), dtype=np.int64), len(SMOOTH_END_TIMES_S))
     # Of the motion that is retimed [s].
+    # Travel is the share of the duration that the path would take at full speed.
     path = duration * travel[shape]
     begin = motion.end_time - path
     feasible = (path < length) & limits.feasible(
         np.maximum(begin, motion.start), duration, shape
     )
+    # A law of duration T replaces a part of length T travel.
     added = np.where(feasible, duration - path, np.inf)
     for best in np.argsort(added)[:MAX_MEASURED_LAWS].tolist():
         if not feasible[best]:

@@ -59,6 +59,7 @@ class Timeline:
                 argument="time",
             )
         states = self._evaluate(flat)
+        # The first set point after a restart has no predecessor.
         q = states.q if self._last_q is None else np.vstack([self._last_q, states.q])
         steps = np.abs(np.diff(q, axis=0))
         if (steps > self._max_step).any():
@@ -69,6 +70,7 @@ class Timeline:
                 f" expected at most {limit} rad (max_step)",
                 argument="time",
             )
+        # Nothing changes before all checks have passed.
         self.now, self._last_q = max(self.now, float(flat[-1])), states.q[-1]
         return _shaped(states, times)
 
@@ -99,6 +101,7 @@ class Timeline:
         """Execute a motion from its start on; return the starts of later ones that it replaces [s]."""
         replaced = self.drop_after(motion.start)
         parts = (*self._parts, motion)
+        # The motion in execution at the begin of the history is kept, too.
         oldest = self.now - self._history
         first = max(
             (index for index, part in enumerate(parts) if part.start <= oldest),
@@ -110,6 +113,7 @@ class Timeline:
     def drop_after(self, time: float) -> list[float]:
         """Drop motions that start at a time [s] or later and have not begun; return their starts."""
         later = [
+            # Motions that have begun are executed already.
             part
             for part in self._parts[1:]
             if part.start >= time and part.start > self.now
@@ -128,10 +132,12 @@ class Timeline:
 
     def _evaluate(self, times: Array) -> SetPoint:
         """Return the states at ascending times, shape (K,)."""
+        # Times in the last motion need no search.
         last = self._parts[-1]
         if times[0] >= last.start:
             return last.at(times)
         starts = np.array([part.start for part in self._parts])
+        # Times before the first motion, by rounding, belong to it.
         index = np.maximum(np.searchsorted(starts, times, side="right") - 1, 0)
         rows = [self._parts[part].at(times[index == part]) for part in np.unique(index)]
         return SetPoint(*(np.concatenate(parts) for parts in zip(*rows, strict=True)))

@@ -88,6 +88,7 @@ def _checks(
 def _is_nominal(constraint: Constraint, problem: Problem, world: PathWorld) -> bool:
     robot, limits = world.robot, problem.limits
     if isinstance(constraint, JointTorque):
+        # The problem's scales are removed: the paper's rules refer to nominal limits.
         values, limit = world.torque, robot.torque_limit / limits.torque_scale
     elif isinstance(constraint, JointVelocity):
         factor = world.parameters.values.get("velocity_factor", 1.0)
@@ -108,6 +109,7 @@ def _is_on_table(table: Table, world: PathWorld) -> bool:
     )
     low, high = (np.array([*corner, table.z], float) for corner in corners)
     low, high = low - TABLE_TOLERANCE_M, high + TABLE_TOLERANCE_M
+    # Comparisons with nan are false, so nan violates the rule.
     return bool(np.all((low[:, None] < tip) & (tip < high[:, None])))
 
 
@@ -128,12 +130,15 @@ def _is_clear(problem: Problem, world: PathWorld, obstacle_poses: Array) -> bool
                 return False
             continue
         low, high = solid.low[:, None].copy(), solid.high[:, None]
+        # A box without a lower end reaches down without limit.
         if obstacle.height is None:
             low[2] = -np.inf
+        # The nearest point of a box is the clipped center.
         offset = center - np.clip(center, low, high)
         distance = np.sqrt(np.einsum("ik,ik->k", offset, offset))
         # At other states no corner is inside.
         corners = world.object_corners(distance < reach)
+        # A corner is inside by its least distance from a face.
         depth = np.minimum(corners - low, high - corners).min(axis=1)
         if not (
             np.all(distance > size[2] / 2 - MAX_OBJECT_DEPTH_M)

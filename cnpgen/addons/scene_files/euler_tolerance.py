@@ -31,11 +31,14 @@ def rotation_vector_tolerance(angles: Array) -> Array:
             "XYZ Euler angles that are free about y, or about two axes, are not"
             " supported: use parameterization 1 (ROTATION_VECTOR)"
         )
+    # Smaller tolerances keep the larger ones, too, and the bound holds up to MAX_ANGLE.
     inner = np.minimum(angles, MAX_ANGLE)
     if free.any():
         # The tilt mixes both components: a square in the circle of the smaller one.
         square = inner[~free].min() / np.sqrt(2)
         return np.where(free, np.pi, square)
+    # |a - wx| is below 3/4 |wy wz| with higher terms, so each tolerance loses this
+    # much.
     reduced = inner - SECOND_ORDER * np.array(
         [inner[1] * inner[2], inner[0] * inner[2], inner[0] * inner[1]]
     )

@@ -109,6 +109,7 @@ class LinkOrientation(_LinkPoseConstraint):
     def bounded(self) -> tuple[int, ...]:
         """Axes with a limit."""
         is_euler = self.parametrization == EULER
+        # The second Euler angle is at most a quarter turn, so that is no limit.
         free = np.pi, (np.pi / 2 if is_euler else np.pi), np.pi
         return tuple(axis for axis in range(3) if self.limits[axis] < free[axis])
 
@@ -131,6 +132,7 @@ class LinkOrientation(_LinkPoseConstraint):
         from cnpgen.kernels.symbolic.linalg import product, rows_of
 
         rotation, _ = _symbolic_pose(state, self.link, np.zeros(3))
+        # D = R_wanted^T R is the rotation away from the wanted orientation.
         D = product(rows_of(turned(*self.rpy).T), rotation)
         euler = self.parametrization == EULER
         g = self._euler_rows(D) if euler else self._vector_rows(D)
@@ -150,6 +152,7 @@ class LinkOrientation(_LinkPoseConstraint):
 
     def _rows(self, axis: int) -> int:
         """Return the number of rows of an axis in the symbolic form."""
+        # Up to a quarter turn, both sides are smooth rows of their own.
         two_sided = self.parametrization == EULER and self.limits[axis] <= np.pi / 2
         return 2 if two_sided else 1
 
@@ -161,6 +164,8 @@ class LinkOrientation(_LinkPoseConstraint):
         """
         import casadi as ca
 
+        # D = Rx Ry Rz has D_12 = -cos b sin a, D_22 = cos b cos a, and D_01 and D_00
+        # likewise for c.
         pairs = {0: (-D[1][2], D[2][2]), 2: (-D[0][1], D[0][0])}
         rows = list[Any]()
         for axis in self.bounded:
@@ -170,6 +175,8 @@ class LinkOrientation(_LinkPoseConstraint):
                 rows += [sine - D[0][2], sine + D[0][2]]
                 continue
             y, x = pairs[axis]
+            # For t up to pi / 2, both sides must hold. Beyond, cos t is negative, and
+            # -|y| cos t is the larger side.
             sides = [x * sine - y * cosine, x * sine + y * cosine]
             rows += sides if self._rows(axis) == 2 else [ca.fmax(*sides)]
         return rows
@@ -182,8 +189,10 @@ class LinkOrientation(_LinkPoseConstraint):
         """
         import casadi as ca
 
+        # trace D = 1 + 2 cos theta, so cos^2 (theta / 2) = (1 + trace) / 4.
         trace = D[0][0] + D[1][1] + D[2][2]
         stretch = _angle_over_sine(ca.sqrt(ca.fmax((1 + trace) / 4, SMOOTHING)))
+        # 1 + D_ii - D_jj - D_kk, with D_jj + D_kk = trace - D_ii.
         squares = [1 + 2 * D[axis][axis] - trace for axis in self.bounded]
         return [
             self.limits[axis] - stretch * ca.sqrt(ca.fmax(square, 0.0) + SMOOTHING)
@@ -224,6 +233,7 @@ class LinkPosition(_LinkPoseConstraint):
             [min(MARGIN_FRACTION * width, MAX_MARGIN_M) for width in _half_widths(each)]
             for each in self.region
         ]
+        # Several regions have one row, whose margin must fit in the narrowest of them.
         smallest = [min(min(row) for row in rows)]
         return np.array(rows[0] if len(rows) == 1 else smallest, float)
 
@@ -239,6 +249,7 @@ class LinkPosition(_LinkPoseConstraint):
 
         _, point = _symbolic_pose(state, self.link, np.array(self.offset))
         rows = [_symbolic_depths(each, point) for each in self.region]
+        # A point is in the union if its least depth in one region is positive.
         if len(rows) > 1:
             rows = [[reduce(ca.fmax, [reduce(ca.fmin, row) for row in rows])]]
         return (self._inside(rows[0], self.margins),)
@@ -254,6 +265,7 @@ class LinkPosition(_LinkPoseConstraint):
 def _half_widths(region: Obstacle) -> list[float]:
     """Return the half widths that belong to the rows of ``_symbolic_depths`` [m]."""
     if region.kind == "box":
+        # Both faces of an axis have the same half width.
         return [size / 2 for size in region.size or () for _ in range(2)]
     radius, half = region.radius or 0.0, (region.length or 0.0) / 2
     return [radius] if region.kind == "sphere" else [radius, half, half]
@@ -267,6 +279,7 @@ def _symbolic_depths(region: Obstacle, point: Sequence[Any]) -> list[Any]:
     from cnpgen.kernels.symbolic.linalg import constants, dot, rows_of, subtract, times
 
     shift = subtract(list(point), constants(np.array(region.position)))
+    # The shift in the frame of the region: p = R^T (x - c).
     p = times(rows_of(turned(*region.rotation).T), shift)
     widths = _half_widths(region)
     if region.kind == "box":
@@ -285,6 +298,7 @@ def _symbolic_depths(region: Obstacle, point: Sequence[Any]) -> list[Any]:
 
 def _depth(region: Obstacle, point: Array) -> Array:
     """Return the depth of points in a region [m], shape () or (K,): the smallest distance from a face."""
+    # Trailing axes let one formula serve one point and K points.
     position = np.array(region.position).reshape(3, *[1] * (point.ndim - 1))
     p = np.einsum("ji,j...->i...", turned(*region.rotation), point - position)
     if region.kind == "box":
@@ -302,6 +316,7 @@ def _euler_angles(D: Array) -> list[Array]:
     """Return the angles of ``D = Rx(a) Ry(b) Rz(c)``, shape () or (K,) each."""
     return [
         np.arctan2(-D[1, 2], D[2, 2]),
+        # D_02 = sin b, and D_00 and D_01 have the length cos b, which is not negative.
         np.arctan2(D[0, 2], np.hypot(D[0, 0], D[0, 1])),
         np.arctan2(-D[0, 1], D[0, 0]),
     ]
@@ -325,8 +340,10 @@ def _angle_over_sine(cosine: Any) -> Any:
 
     product = 1.0
     for _ in range(3):
+        # Half angles: cos (v / 2) = sqrt((1 + cos v) / 2).
         cosine = ca.sqrt((1 + cosine) / 2)
         product = product * cosine
+    # sin^2 v of the last half angle, v = u / 8.
     square = 1 - cosine**2
     series = 1 + square * (1 / 6 + square * (3 / 40 + square * (15 / 336)))
     return series / product
@@ -335,6 +352,7 @@ def _angle_over_sine(cosine: Any) -> Any:
 def _frame(robot: Robot, link: str) -> Any:
     """Return Pinocchio's frame of a link that the planned joints move; RecipeError for others."""
     index = frame_of(robot.model, link)
+    # Parent 0 is the universe: the planned joints do not move such a frame.
     if index >= robot.model.nframes or not robot.model.frames[index].parentJoint:
         raise RecipeError(
             [f"constraint.link: the planned joints move no link {link!r}"]
@@ -350,6 +368,7 @@ def _symbolic_pose(
 
     frame, kinematics = _frame(state.robot, link), state.kinematics
     R, joint = frame.placement.rotation, frame.parentJoint - 1
+    # Pinocchio counts the universe as joint 0, the kinematics do not.
     axes, point = kinematics.frames[joint], frame.placement.translation + R @ offset
     position = add(kinematics.origins[joint], times(axes, constants(point)))
     return product(axes, rows_of(R)), position

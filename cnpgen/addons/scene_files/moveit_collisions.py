@@ -54,17 +54,20 @@ def read_allowed_collisions(
     pairs, world = {*_allowed_pairs(matrix, place)}, [*objects, OCTOMAP]
     names = {str(name) for name in part(matrix, "entry_names", list, place)}
     refused = [f"{name} and all others" for name in always if name in attached]
+    # A default of true must not contradict entries of false or other defaults.
     for name in always:
         entries = names - {name} if name in names else set[str]()
         others = sorted(other for other in entries if {name, other} not in pairs)
         refused += [f"true for {name} and false for it and {other}" for other in others]
         refused += [f"true for {name} and false for {other}" for other in never]
+        # A name without a contradiction may touch all objects.
         pairs |= {frozenset((name, each)) for each in (*world, *attached)}
     touching = dict[str, list[str]]()
     for pair in sorted(pairs, key=sorted):
         # The object of the world comes first, then the one that is attached.
         rank = {name: (name not in world, name not in attached, name) for name in pair}
         body, *others = sorted(pair, key=rank.__getitem__)
+        # Two links are a matter of the robot, and two objects of the world never move.
         if not pair.isdisjoint((*world, *attached)) and not pair.issubset(world):
             touching.setdefault(body, []).extend(others)
     if matrix:
@@ -126,6 +129,7 @@ def read_link_sizes(
             links.add(link)
             if not neutral[column] <= value <= most:
                 bounds = f"{neutral[column]:g} to {most:g} for the link {link!r}"
+                # Links may grow only, so smaller scales are refused.
                 entry.account.refuse(key, value, f"expected {bounds}, as links grow")
             elif value != neutral[column]:
                 sizes.setdefault(link, [*neutral])[column] = value

@@ -42,6 +42,7 @@ class FrameTable:
         """Return a pose in the last frame that the table does not place: empty for the base, or that of a link."""
         visited = set[str]()
         while frame in self._frames:
+            # A circle of frames would never end.
             if frame in visited:
                 raise SceneError(
                     f"{self._place}: the frames {', '.join(sorted(visited))} are placed in a circle"
@@ -98,6 +99,8 @@ def transform_of(transform: Any, where: str) -> Pose:
         raise SceneError(
             f"{where}: translation must be finite and at most {MAX_COORDINATE_M:g}, got {shift.tolist()}"
         )
+    # Transforms that change nothing become the object IDENTITY, by which they are
+    # recognized.
     same = not shift.any() and np.abs(turn - np.eye(3)).max() <= MAX_BASE_TILT
     return IDENTITY if same else (shift, turn)
 
@@ -107,6 +110,7 @@ def rotation_of(xyzw: Any, where: str) -> Array:
     quaternion = vector(xyzw, "xyzw", f"{where}: orientation")
     if text := quaternion_error(quaternion):
         raise SceneError(f"{where}: {text}")
+    # Messages state (x, y, z, w), the function takes (w, x, y, z).
     return rotation_matrix(quaternion[[3, 0, 1, 2]])
 
 
@@ -147,7 +151,9 @@ def add_base(table: FrameTable, state: Any, where: str) -> None:
     if not moved:
         return
     shift, turn = moved[0]
+    # The cosine of the angle between both z axes.
     if abs(turn[2, 2] - 1) > MAX_BASE_TILT:
         raise SceneError(f"{where} tilts the base: gravity is along z of the base")
+    # Poses in the planning frame need the inverse of the base's pose: (-R^T t, R^T).
     for name in BASE_FRAMES:
         table.add(name, BASE, (-turn.T @ shift, turn.T))

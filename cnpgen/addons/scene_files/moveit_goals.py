@@ -46,6 +46,7 @@ def read_start(
     positions = vector(
         part(joints, "position", list, where), "", f"{where}: start_state position"
     )
+    # An empty state stands for the present one in MoveIt's messages.
     if present and not names and not len(positions):
         return tuple(present), np.array([*present.values()], float), None
     if not names or len(names) != len(positions):
@@ -133,6 +134,7 @@ def read_goal_pose(
     position, link = positions[0], part(positions[0], "link_name", str, where)
     check_weight(position, where)
     center, radius = _region(position, where)
+    # Without a constraint, the orientation is free: a tolerance of pi about each axis.
     frame, turn, tolerance = frame_id(position, where), np.eye(3), np.full(3, np.pi)
     if orientations:
         if part(orientations[0], "link_name", str, where) != link:
@@ -144,6 +146,7 @@ def read_goal_pose(
                 f"{where}: position and orientation of a goal must be in one frame"
             )
         turn, tolerance = _goal_orientation(orientations[0], where)
+    # The goal is expressed in the last frame that the document does not place.
     frame, placed = table.resolve(frame, (center, turn))
     return frame, GoalPose(
         frame=link,

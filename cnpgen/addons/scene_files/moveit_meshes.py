@@ -80,6 +80,7 @@ def _file(name: str, scene: Path, packages: Sequence[Path], where: str) -> Path:
     is_package = name.startswith(PACKAGE)
     relative = PurePosixPath(name.removeprefix(PACKAGE))
     names_a_file = bool(relative.parts) and ":" not in str(relative)
+    # Absolute paths, drives and parents would leave the given folders.
     if not names_a_file or relative.is_absolute() or ".." in relative.parts:
         raise SceneError(
             f"{where}: expected a path below the folder of the scene or below --packages,"
@@ -87,6 +88,7 @@ def _file(name: str, scene: Path, packages: Sequence[Path], where: str) -> Path:
         )
     rest = PurePosixPath(*relative.parts[1:])
     places = [] if is_package else [(scene.parent, scene.parent / relative)]
+    # A package may be the folder itself, or lie in it.
     for folder in packages:
         places.append((folder, folder / relative))
         if is_package and folder.name == relative.parts[0]:

@@ -44,6 +44,7 @@ class CollisionObject:
     @property
     def origin(self) -> Pose:
         """Pose of the frame of the object; without a pose that of its only shape, as in MoveIt."""
+        # Without a pose of its own, an object with one shape is placed by the shape.
         if self.pose is IDENTITY and len(self.shapes) == 1:
             return self.shapes[0].pose
         return self.pose
@@ -62,6 +63,7 @@ def read_world(scene: Any, place: str) -> dict[str, CollisionObject]:
     objects: dict[str, CollisionObject] = {}
     for entry in entries:
         _apply(objects, entry, place)
+        # The count is checked after every message, before a later one removes shapes.
         check_count(sum(len(each.shapes) for each in objects.values()), place)
     return objects
 
@@ -79,6 +81,7 @@ def _apply(objects: dict[str, CollisionObject], entry: Any, place: str) -> None:
         objects[name] = _moved(objects.get(name), entry, where)
     elif operation == "APPEND" and name in objects:
         objects[name] = _appended(objects[name], read_object(entry, where), where)
+    # Objects without an id get numbered names instead.
     elif name in objects and "id" in entry:
         raise SceneError(
             f"{where} is added twice: ADD replaces the first; APPEND adds shapes, and different objects need different ids"
@@ -203,6 +206,7 @@ def read_attached(
             raise SceneError(f"{place} has no link_name")
         if operation_of(body, place) != "ADD":
             raise SceneError(f"{place}: operation must be ADD, which attaches it")
+        # An attached object leaves the world, as it moves with the link from here on.
         item, known = read_object(body, place), objects.pop(name, None)
         if not item.shapes and known is None:
             raise SceneError(

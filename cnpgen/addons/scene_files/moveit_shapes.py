@@ -136,6 +136,7 @@ def _vertices(mesh: Any, where: str) -> Array:
 
 def _check_triangles(mesh: Any, vertices: int, where: str) -> None:
     """Check that the triangles of a mesh, whose hull counts, refer to its vertices."""
+    # Triangles are checked although only the hull of the vertices is used.
     for triangle in part(mesh, "triangles", list, where):
         for index in vector(
             part(triangle, "vertex_indices", list, where),

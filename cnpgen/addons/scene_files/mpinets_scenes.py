@@ -94,6 +94,7 @@ def read_mpinets(
 def _check_names(file: Hdf5, account: Account) -> None:
     """Refuse datasets and attributes that are not read; trajectories are unused if there are starts and goals."""
     entries = accounted(dict.fromkeys((*file.names(), *file.attributes)), account)
+    # Starts and goals take precedence, so trajectories beside them are unused.
     ends = next((both for both in _ENDS if all(name in file for name in both)), ())
     trajectory = next((name for name in _TRAJECTORIES if name in file), "")
     used = [*ends, SCENE_NAMES] if ends else [trajectory, SCENE_NAMES]
@@ -154,6 +155,7 @@ def _entries(file: Hdf5, kind: str, rows: slice, count: int) -> Array:
     columns.append(_column(file, f"{word}_centers", 3, rows, count))
     if kind == "sphere":
         columns.append(
+            # Spheres have no quaternions in the file: theirs is the identity.
             np.broadcast_to([1.0, 0.0, 0.0, 0.0], (*columns[0].shape[:2], 4))
         )
     else:
@@ -173,6 +175,7 @@ def _column(file: Hdf5, name: str, width: int, rows: slice, count: int) -> Array
         raise SceneError(f"{file.path} lacks {name}")
     values = np.asarray(file[name].read(rows), float)
     if values.ndim == 2:
+        # Two axes are one number for each of M obstacles, or one obstacle per row.
         values = values[:, :, None] if width == 1 else values[:, None]
     if values.ndim != 3 or len(values) != count or values.shape[2] != width:
         raise SceneError(
@@ -184,6 +187,7 @@ def _column(file: Hdf5, name: str, width: int, rows: slice, count: int) -> Array
 def _names(file: Hdf5, rows: slice, count: int) -> list[str]:
     """Return the names of the scenes: those in the file, or the numbers of their rows."""
     if SCENE_NAMES not in file.attributes:
+        # Numbers of rows are those of the file, also for a part of it.
         first = rows.start or 0
         return [str(first + row) for row in range(count)]
     text = file.attributes[SCENE_NAMES]
@@ -248,6 +252,7 @@ def mpinets_bytes(scenes: Sequence[SceneProblem]) -> bytes:
     buffer = io.BytesIO()
     with h5py.File(create_hdf5(buffer)) as file:
         for name, values in columns.items():
+            # Times of writing would make equal scenes different bytes.
             file.create_dataset(name, data=values, track_times=False)
         text = "\n".join(scene.name.replace("\n", " ") for scene in scenes).encode()
         file.attrs[SCENE_NAMES] = np.array(text, h5py.string_dtype("utf-8", len(text)))
@@ -258,6 +263,7 @@ def _padded(kind: str, obstacles: list[list[Obstacle]]) -> dict[str, Array]:
     """Return the datasets of a kind, padded with zeros."""
     names, widths, word = _SHAPES[kind]
     most = max(map(len, obstacles), default=0)
+    # Files of others have no spheres, so an empty dataset is left out.
     if kind == "sphere" and not most:
         return {}
     count, width = len(obstacles), sum(widths)
@@ -272,6 +278,7 @@ def _padded(kind: str, obstacles: list[list[Obstacle]]) -> dict[str, Array]:
                 *(item.position or ()),
                 *quaternion_of(turned(*item.rotation)),
             ]
+    # Columns are sizes, center and quaternion.
     ends = np.cumsum([*widths, 3])
     parts = np.split(values, ends, axis=2)
     found = dict(

@@ -66,6 +66,7 @@ def read_octomap(
         np.isfinite(values) & (np.abs(values) < 256) & (values == values.round())
     ).all():
         raise SceneError(f"{where}: data must be bytes")
+    # Messages have signed bytes, octrees unsigned ones.
     data = (values.astype(int) % 256).astype(np.uint8).tobytes()
     is_binary = str(tree.get("binary", "false")).strip().lower() in {"true", "1", "1.0"}
     cells = decoded_cells(data, is_binary=is_binary, where=where)
@@ -116,12 +117,14 @@ def _read_binary(data: bytes, at: int, cell: Cell, cells: list[Cell]) -> int:
     """Read an inner node of a binary tree; return the position behind it."""
     if at + 2 > len(data):
         raise ValueError(f"it is cut off at byte {at}")
+    # Two bytes in little-endian order: bits 2 i and 2 i + 1 are those of child i.
     bits = data[at] | data[at + 1] << 8
     kinds = [bits >> 2 * child & 3 for child in range(8)]
     children, at = _children(cell), at + 2
     cells += [
         each for each, kind in zip(children, kinds, strict=True) if kind == OCCUPIED
     ]
+    # Depth first: children with children follow in the order of their indices.
     for each, kind in zip(children, kinds, strict=True):
         if kind == INNER:
             at = _read_binary(data, at, each, cells)
@@ -151,6 +154,7 @@ def _boxes(
     """Return boxes that contain all cells, along the axes of the octree."""
     # Leaves are divided into cells of the smallest leaf, whose centers are points.
     edge = min(cell[3] for cell in cells)
+    # Cells above the largest resolution of point clouds are divided further.
     while edge * resolution > MAX_RESOLUTION_M:
         edge //= 2
     # The root is around the origin.
@@ -163,6 +167,7 @@ def _boxes(
         raise SceneError(
             f"{where} reaches {reach:.3g} m from its origin, expected at most {PLAUSIBLE_MAX['m']:g} m"
         )
+    # The number of points is known before their memory is used.
     count = sum((cell[3] // edge) ** 3 for cell in cells)
     if count > MAX_POINTS:
         raise SceneError(
@@ -170,6 +175,7 @@ def _boxes(
         )
     points = np.concatenate([_centers(cell, edge) for cell in cells])
     size = edge * resolution
+    # Cells are counted from the lower corner of the root, meters from its center.
     centers = (points - center) * resolution
     try:
         return obstacles_of_points(
@@ -185,6 +191,7 @@ def _boxes(
 
 def _centers(cell: Cell, edge: int) -> Array:
     """Return the centers of the parts of a cell with an edge length, shape (K, 3)."""
+    # Midpoints of equal parts along each axis.
     steps = (np.arange(cell[3] // edge) + 0.5) * edge
     axes = [start + steps for start in cell[:3]]
     return np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)

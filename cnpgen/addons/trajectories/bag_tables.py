@@ -140,6 +140,7 @@ def _plain(value: Any) -> Any:
         return {
             entry.name: _plain(getattr(value, entry.name))
             for entry in fields(value)
+            # Definitions of rosbags have constants and names that are no values.
             if not entry.name.startswith("__")
         }
     if isinstance(value, np.ndarray):

@@ -30,6 +30,7 @@ def explain_velocities(
     assert trajectory.dq is not None
     h = np.diff(trajectory.t)
     mean = np.diff(trajectory.q, axis=0) / h[:, None]
+    # A mean velocity has an error of 2 e / h from both positions.
     noise = 2 * errors.q / float(np.median(h)) + errors.dq
     size = _rms(mean[:, joint])
     if size <= noise:
@@ -49,6 +50,8 @@ def _explanations(
     dq: Array, mean: Array, joint: int, joint_names: tuple[str, ...]
 ) -> Iterator[tuple[str, Array, slice]]:
     """Yield explanations, the velocities that each corrects, and the spans that these cover."""
+    # Shifted velocities lack one span at an end of the motion; other explanations cover
+    # all.
     name, own, every = joint_names[joint], dq[:, joint], slice(None)
     between = _mean_of_neighbors(own)
     # Least squares: recorded velocity = factor * true velocity.
@@ -63,6 +66,7 @@ def _explanations(
         if other != joint:
             text = f"those of {name} are in the column of {other_name}"
             yield text, dq[:, other], every
+    # Any other factor is the last explanation: units and signs name the cause.
     if factor:
         yield f"those of {name} are {factor:.3g} times as large", own / factor, every
 

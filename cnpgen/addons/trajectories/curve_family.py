@@ -78,6 +78,8 @@ class CurveFamily:
 
         See ``Curve``.
         """
+        # Bernstein coefficients bound a polynomial. With s = t / T, derivatives by s
+        # have factors T and T^2.
         first, second = (
             np.abs(values).max(axis=0)
             for values in (self.polynomials.dq, self.polynomials.ddq)
@@ -86,6 +88,7 @@ class CurveFamily:
 
     def max_positions(self) -> Array:
         """Bound the absolute positions of all curves [rad], shape (n,)."""
+        # A polynomial lies in the convex hull of its coefficients.
         return np.asarray(
             (np.abs(self.coefficients).max(axis=0) + self.bounds[0]).max(axis=0)
         )
@@ -101,6 +104,7 @@ def _derivative(coefficients: Array, lengths: Array) -> Array:
     """Differentiate polynomials by time, shape (d + 1, S, n) -> (max(d, 1), S, n)."""
     if len(coefficients) == 1:
         return np.zeros_like(coefficients)
+    # Coefficients of the derivative: d (b_k+1 - b_k) / h, with the degree d.
     return np.asarray(
         (len(coefficients) - 1) * np.diff(coefficients, axis=0) / lengths[:, None]
     )
@@ -109,6 +113,7 @@ def _derivative(coefficients: Array, lengths: Array) -> Array:
 def _values(coefficients: Array, span: NDArray[np.intp], u: Array) -> Array:
     """Evaluate polynomials in their spans, shape (n, K)."""
     degree = len(coefficients) - 1
+    # B_k(u) = C(d, k) u^k (1 - u)^(d - k).
     basis = [
         comb(degree, k) * u**k * (1 - u) ** (degree - k) for k in range(degree + 1)
     ]

@@ -157,6 +157,7 @@ def _file_findings(episode: Episode) -> Iterator[EpisodeFinding]:
     tables = {"state": episode.state, "time": episode.t[:, None]}
     if episode.action is not None:
         tables["action"] = episode.action
+    # Numbers come first: later checks compare and subtract them.
     for name, values in tables.items():
         bad = np.argwhere(~np.isfinite(values))
         if len(bad):
@@ -187,6 +188,7 @@ def _still_findings(episode: Episode) -> Iterator[EpisodeFinding]:
     """Yield a time in which all states are equal while the actions change."""
     if episode.action is None or len(episode.t) < 3:
         return
+    # Edges of runs: pairs of begins and ends of equal states.
     equal = (np.diff(episode.state, axis=0) == 0).all(axis=1)
     edges = np.flatnonzero(np.diff(np.concatenate([[0], equal.astype(int), [0]])))
     for start, end in edges.reshape(-1, 2).tolist():
@@ -212,6 +214,7 @@ def _limit_findings(
     noise, jitter = errors
     error, known, text = _noise(q, arm, noise)
     period = float(np.median(np.diff(episode.t)))
+    # Without a clock, half a period is assumed as error of the times.
     is_assumed = jitter is None and episode.is_nominal
     if jitter is None:
         jitter = NOMINAL_JITTER * period if is_assumed else time_rounding(episode.t)[1]
@@ -235,7 +238,10 @@ def _limit_findings(
         worst = _worst(limit, islice(found, lags))
         if worst is None:
             continue
+        # Only limits of the vendor exclude, with a known noise, and not of
+        # accelerations.
         proven = known and limit.basis == VENDOR and quantity != "acceleration"
+        # A velocity that a stall of the recorder explains is for review.
         if proven and quantity == "velocity" and largest > jitter:
             stalled = first_derivatives(episode.t, q, error, largest)
             proven = (of_stall := _worst(limit, islice(stalled, lags))) is not None
@@ -255,6 +261,7 @@ def _limit_findings(
 
 def _noise(q: Array, arm: RecordedArm, noise: float | None) -> tuple[float, bool, str]:
     """Return the error of positions [rad], whether it is known, and its text."""
+    # The visible rounding is a lower bound of the noise.
     half = rounding(q)[1]
     if noise is not None:
         return max(noise, half), True, f"noise {max(noise, half):.2g} rad, stated"
@@ -274,8 +281,10 @@ def _worst(
             (bounds.low, limit.upper, 1),
             (bounds.high, limit.lower, -1),
         ):
+            # Excess relative to the range makes joints of different ranges comparable.
             scale = np.maximum(limit.upper - limit.lower, 1e-9)
             excess = sign * (values - ends) / scale
+            # Bounds that say nothing are infinite.
             excess = np.where(np.isfinite(excess), excess, -np.inf)
             k, joint = np.unravel_index(int(excess.argmax()), excess.shape)
             size = float(excess[k, joint])

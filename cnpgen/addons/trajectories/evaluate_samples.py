@@ -99,7 +99,7 @@ def run(arguments: argparse.Namespace) -> int:
             progress=meter,
         )
     if arguments.json:
-        write_json(arguments.file, found, loaded.labels)
+        write_json(arguments.file, loaded, found)
     else:
         print(summary_text(arguments.file, found))
         if arguments.list:

@@ -155,6 +155,7 @@ def distance_from_samples(
     """
     rows = zip(plans, imported, trajectories, strict=True)
     distances = []
+    # Phases are invariant under changes of the timing.
     for plan, before, trajectory in rows:
         s = before.motion.phase_at(trajectory.t[None])
         distances.append(np.abs(plan.motion.at(s).q[0] - trajectory.q).max())
@@ -167,6 +168,8 @@ def _boundary(
     """Return the boundary conditions of one trajectory and the change of their positions by snapping [rad]."""
     estimate = sampled_boundary(trajectory.t, trajectory.q, trajectory.dq)
     speed_error = (
+        # Errors e at both ends of a window w look like a velocity 2 e / w, and those of
+        # two velocities like an acceleration.
         noise[1] if trajectory.dq is not None else 2 * noise[0] / REST_WINDOW_S
     )
     acceleration_error = (
@@ -217,6 +220,7 @@ def _snapped(
         (q, dq if given[0] else still, ddq if given[1] else still),
     ]
     for candidate in candidates:
+        # From all derivatives to the given ones only.
         found = snapper(candidate, end)
         change = float(np.abs(found[0] - q).max())
         if change <= allowed:
@@ -230,11 +234,14 @@ def _fit_samples(
     """Return times, positions and, only if samples are few, velocities: enough of them for C control points."""
     count = len(trajectory.t)
     chosen = np.unique(
+        # Samples are thinned evenly: more of them than the path resolves only cost
+        # time.
         np.linspace(0, count - 1, min(count, FIT_SAMPLES_PER_POINT * points))
         .round()
         .astype(np.intp)
     )
     few = trajectory.dq is not None and count < MIN_SAMPLES_PER_POINT * points
+    # Velocities determine the path where positions are fewer than control points need.
     return (
         trajectory.t[chosen],
         trajectory.q[chosen],
@@ -261,6 +268,7 @@ def _fitted(
             [largest_error(motion, each.t, each.q) for motion, each in pairs]
         )
         if (errors <= max_error).all() or points >= MAX_CONTROL_POINTS:
+            # All plans share one number of control points, as one file stores them.
             return motions, errors
         points = min(round(GROWTH * points), MAX_CONTROL_POINTS)
 
@@ -280,19 +288,26 @@ class StateSnapper:
         self._world = World(robot, problem.obstacle, problem.object_size)
         self._problem = problem
         self.set_parameters(None)
+        # Scaled states make minimum-norm steps compare positions, velocities and
+        # accelerations.
         self._scale = np.repeat(SCALES, robot.n)
 
     def set_parameters(self, parameters: Array | None) -> None:
         """Set the values of the problem's parameters, shape (p,); nominal for None."""
         rows = None if parameters is None else parameters[None]
         nowhere = np.zeros((1, 3))
+        # Distances are not considered, so the scene may have any ends.
         self._poses = scene_of(self._problem, nowhere, nowhere, nowhere, rows).poses[0]
 
     def __call__(self, state: State, end: End) -> State:
         """Move a state at an end, or return the last one that was reached if the constraints cannot be met."""
+        # Gauss-Newton: x -= J^+ r, with the least change of all that meets the
+        # linearized rows.
         x = np.concatenate(state) / self._scale
         for _ in range(MAX_ITERATIONS):
             g, lower, upper = self._values(x, end)
+            # Targets are slightly inside the bounds, so rounding does not violate them
+            # again.
             inset = BOUND_INSET * np.where(
                 np.isfinite(upper - lower), upper - lower, 1.0
             )
@@ -301,10 +316,12 @@ class StateSnapper:
                 g - lower - inset,
                 np.where(g > upper, g - upper + inset, 0.0),
             )
+            # Conditions within their bounds do not restrict the step.
             rows = np.flatnonzero(np.abs(residual) > MAX_RESIDUAL)
             if not len(rows) or not np.isfinite(g).all():
                 break
             steps = DIFFERENCE * np.eye(len(x))
+            # Central differences: J = (g(x + d) - g(x - d)) / (2 d).
             changes = [
                 self._values(x + step, end)[0][rows]
                 - self._values(x - step, end)[0][rows]

@@ -56,9 +56,13 @@ def interpolated(
     data = data[: _DERIVATIVES[kind] + 1]
     h = np.diff(trajectory.t)
     weights = hermite_weights(len(data))
+    # Coefficients b = W d of every span, with data d for a span of length 1.
     coefficients = np.einsum("cw,swn->csn", weights, span_data(data, h))
     orders = np.tile(np.arange(len(data)), 2)
+    # With u = (t - t_i) / h, a derivative of order k by u is h^k times that by t.
     scaled_noise = noise[orders] * h[:, None] ** orders
+    # Errors e of the data change a coefficient by at most sum |w| e. Values of the
+    # polynomial change by no more than its coefficients (convex hull).
     effects = [
         scaled_noise @ np.abs(differentiated(weights, order)).T for order in range(4)
     ]
@@ -70,6 +74,7 @@ def interpolated(
     for order in range(len(data) + 1, 4):
         bounds[order] = np.full_like(bounds[order], UNDEFINED)
     if kind == "hold":
+        # A held position jumps at the next sample: the error covers the jump.
         bounds[0] = bounds[0] + np.abs(np.diff(trajectory.q, axis=0))
         bounds[1] = bounds[2] = bounds[3] = np.full_like(bounds[0], UNDEFINED)
     return CurveFamily(
@@ -117,6 +122,8 @@ def bounded_jerk(
                 "a bound of the jerk needs at least 3 samples of positions",
                 concerns="max_jerk",
             )
+        # Dense samples of positions alone amplify noise: fewer of them bound
+        # derivatives better.
         chosen = _thinned(trajectory.t, float(max_jerk.min()), float(noise[0]))
         t, data = trajectory.t[chosen], [trajectory.q[chosen]]
         h = np.diff(t)
@@ -126,6 +133,7 @@ def bounded_jerk(
         t = trajectory.t
         h = np.diff(t)
         orders = np.tile(np.arange(len(data)), 2)
+        # Data of both ends are at the phases 0 and 1.
         nodes = np.broadcast_to(
             np.repeat([0.0, 1.0], len(data)), (len(h), 2 * len(data))
         )
@@ -143,6 +151,8 @@ def bounded_jerk(
             .sum(axis=2)
             .max(axis=1)
         )
+        # Let |jerk| <= J. With u as unit of time, a curve differs from its polynomial
+        # by at most the integral of the absolute kernel times J h^3.
         error = (kernel * h**3)[:, None] * max_jerk + from_noise[:, None]
         bounds.append(error / h[:, None] ** order)
     family = CurveFamily(
@@ -150,6 +160,7 @@ def bounded_jerk(
     )
     if not _is_consistent(family, weights, scaled_noise, data, max_jerk, noise):
         return None
+    # The jerk of a curve is anywhere within the bound: its nominal value is 0.
     wide = np.repeat(max_jerk[None], len(h), axis=0)
     return replace(family, bounds=(*family.bounds[:3], wide), has_jerk=False)
 
@@ -165,6 +176,8 @@ def data_of(trajectory: Trajectory) -> list[Array]:
 
 def _thinned(t: Array, max_jerk: float, noise: float) -> NDArray[np.intp]:
     """Choose samples whose distance minimizes the error of velocities: noise / h grows where max_jerk h^2 falls."""
+    # Central differences of positions have an error of e / h + J h^2 / 6, smallest at h
+    # = (3 e / J)^(1/3).
     best = (3 * noise / max_jerk) ** (1 / 3) if max_jerk > 0 else t[-1]
     steps = max(STENCIL, int(np.ceil(t[-1] / max(best, t[-1] / (len(t) - 1)))))
     return np.unique(np.linspace(0, len(t) - 1, steps + 1).round().astype(np.intp))
@@ -192,6 +205,7 @@ def polynomials_of_positions(
     W), and the positions, shape (S, W, n).
     """
     size, count = min(neighbors, len(t)), len(t) - 1
+    # The span is in the middle of its window, but at both ends of the samples.
     first = np.clip(np.arange(count) - (size // 2 - 1), 0, len(t) - size)
     window = first[:, None] + np.arange(size)
     nodes = (t[window] - t[:-1, None]) / np.diff(t)[:, None]
@@ -205,8 +219,11 @@ def hermite_weights(m: int) -> Array:
     # The k-th coefficient from an end is a sum of its derivatives.
     for k in range(m):
         for order in range(k + 1):
+            # b_k = sum_j C(k, j) (d - j)! / d! f^(j)(0), with the degree d.
             share = comb(k, order) * factorial(degree - order) / factorial(degree)
             weights[k, order] = share
+            # From the other end, the phase runs backward, which changes odd
+            # derivatives.
             weights[degree - k, m + order] = share * (-1) ** order
     return weights
 
@@ -221,10 +238,13 @@ def _lagrange_weights(nodes: Array) -> Array:
         polynomial[:, 0] = 1.0
         for other in range(size):
             if other != node:
+                # Multiplication by (u - u_j): powers shift by one, minus u_j times the
+                # polynomial.
                 shifted = np.roll(polynomial, 1, axis=1)
                 product = shifted - nodes[:, other, None] * polynomial
                 polynomial = product / (nodes[:, node] - nodes[:, other])[:, None]
         powers[:, :, node] = polynomial
+    # Powers become Bernstein coefficients: b_i = sum_k C(i, k) / C(d, k) a_k.
     to_bernstein = np.array(
         [[comb(i, k) / comb(size - 1, k) for k in range(size)] for i in range(size)]
     )
@@ -245,6 +265,8 @@ def _kernel_norms(
     nodes: Array, orders: NDArray[np.intp], weights: Array, order: int
 ) -> Array:
     """Integrate the absolute Peano kernel of a derivative over the nodes of every span, at most over it, shape (S,)."""
+    # Spans with equal nodes have equal kernels: equal sampling needs only a few
+    # integrals.
     _, chosen, inverse = np.unique(
         np.round(nodes, 6), axis=0, return_index=True, return_inverse=True
     )
@@ -259,6 +281,7 @@ def _kernel_norm(
 ) -> float:
     """Return the integral of one span; see ``_kernel_norms``."""
     low, high = min(nodes.min(), 0.0), max(nodes.max(), 1.0)
+    # Midpoints of equal parts of the window integrate the kernel.
     tau = low + (high - low) * (np.arange(KERNEL_NODES) + 0.5) / KERNEL_NODES
     u = np.linspace(0, 1, KERNEL_PHASES)
     coefficients = differentiated(weights, order)
@@ -266,12 +289,15 @@ def _kernel_norm(
     basis = np.stack(
         [comb(degree, k) * u**k * (1 - u) ** (degree - k) for k in range(degree + 1)]
     )
+    # A jerk of 1 at tau gives the curve (x - tau)_+^2 / 2. The kernel is its derivative
+    # minus that of the polynomial through its data (Peano).
     from_data = np.stack(
         [_truncated(node - tau, 2 - k) for node, k in zip(nodes, orders, strict=True)]
     )
     kernel = (
         _truncated(u[:, None] - tau, 2 - order) - (basis.T @ coefficients) @ from_data
     )
+    # The mean times the length is the integral; the phase with the largest one counts.
     return float(np.abs(kernel).mean(axis=1).max() * (high - low) * KERNEL_MARGIN)
 
 
@@ -296,10 +322,12 @@ def _is_consistent(  # noqa: PLR0917 - the family with everything that it was ma
     """
     h = np.diff(family.t)[:, None]
     limit = max_jerk * (1 + CONSISTENCY_TOLERANCE)
+    # Third differences amplify the rounding of coefficients.
     rounding = 1e-12 * (np.abs(family.coefficients).max() + 1)
     if len(data) == 3:
         change = np.abs(np.diff(data[2], axis=0))
         return bool((change <= limit * h + 2 * noise[2] + rounding).all())
+    # Fewer data than these determine no cubic, so its third derivative says nothing.
     if weights.shape[1] < STENCIL:
         return True
     third = family.polynomials.jerk

@@ -149,6 +149,7 @@ class FamilyJudge:
         scene: Array | None,
         smooth: CurveFamily | None,
     ) -> TrajectoryVerdict:
+        # Phase and time are proportional: both ends determine the table.
         table = np.array([[0.0, 1.0], [0.0, family.duration]])
         samples = Samples(s, times(s, table))
         states = family.evaluate(s, jerk=self._problem.uses_jerk)
@@ -162,6 +163,8 @@ class FamilyJudge:
         if scene is None:
             poses = self._obstacle_poses(states.q, states.dq, trajectory.parameters)
             scenes = self._possible_scenes(family, states, poses, trajectory.parameters)
+            # Poses that the samples state replace those that follow from the ends of
+            # the curve.
             if (placed := trajectory.obstacle_poses) is not None:
                 for each in (poses, *scenes):
                     each[: len(placed)] = placed
@@ -177,12 +180,14 @@ class FamilyJudge:
         )
         measured = [errors.add(condition, s) for condition in context.measured]
         context = replace(context, measured=measured, with_uncertainty=errors.add)
+        # Parameters such as velocity_factor may scale the limits.
         limits = self._limits.scaled(self._world.parameters.values)
         entries = [
             *_limit_entries(limits, family, smooth, samples),
             *_measured_entries(context),
         ]
         names = list(by_name([entry.margin for entry in entries]))
+        # Conditions of one name get numbered names, in the order of the entries.
         return _verdict(dict(zip(names, entries, strict=True)), family.duration, len(s))
 
     def _obstacle_poses(self, q: Array, dq: Array, parameters: Array | None) -> Array:
@@ -191,6 +196,7 @@ class FamilyJudge:
             (np.ascontiguousarray(x[:, [0, -1]]) for x in (q, dq)),
             np.zeros((len(q), 2)),
         )
+        # The tip depends on the joints alone, so its scene may have any ends.
         poses = scene_of(self._problem, *np.zeros((3, 1, 3))).poses[0]
         self._world.set_path(ends, speeds, still, poses, still)
         start, goal = self._world.tip_position.T[:, None].copy()
@@ -214,6 +220,8 @@ class FamilyJudge:
         position, velocity, acceleration = (bound[-1] for bound in family.bounds[:3])
         if (acceleration >= UNDEFINED).all():
             # Velocities jump between spans.
+            # The jump at the last knot but one is a further error of the final
+            # velocity.
             velocity = velocity + np.abs(
                 states.dq[:, -1] - family.polynomials.dq[-1, max(len(family.t) - 3, 0)]
             )
@@ -223,6 +231,7 @@ class FamilyJudge:
         ):
             if not bound.any():
                 continue
+            # All joints together first, then each alone.
             for joint in (None, *np.flatnonzero(bound).tolist()):
                 ends = {
                     name: getattr(states, name)[:, [0, -1]].copy()
@@ -231,23 +240,27 @@ class FamilyJudge:
                 moved = slice(None) if joint is None else joint
                 ends[order][moved, -1] += sign * bound[moved]
                 scene = self._obstacle_poses(ends["q"], ends["dq"], parameters)
+                # Poses and sizes stay; only the values behind them follow the motion.
                 scenes.append(np.concatenate([poses[:known], scene[known:]]))
         return scenes
 
 
 def checked_phases(family: CurveFamily, step: float) -> Array:
     """Return phases at and between the knots, with both sides of every knot, at steps of at most ``step`` [s]."""
+    # About MAX_TIME_SAMPLES phases in all: spans of long motions get coarser parts.
     count = max(1, int(np.ceil(MAX_TIME_SAMPLES / len(family.t))))
     parts = np.clip(
         np.ceil(np.diff(family.t) / step).astype(np.intp),
         MIN_SPAN_PARTS,
         count + MIN_SPAN_PARTS,
     )
+    # The index in the span divided by its number of parts is the share of the span.
     first = np.repeat(np.cumsum(parts) - parts, parts)
     share = (np.arange(parts.sum()) - first) / np.repeat(parts, parts)
     low, high = (np.repeat(family.edges[k:][: len(parts)], parts) for k in (0, 1))
     inner = low + share * (high - low)
     return np.unique(
+        # The largest number below a knot is its left side, where derivatives may jump.
         np.concatenate([inner, np.nextafter(family.edges[1:-1], 0.0), family.edges])
     )
 
@@ -301,14 +314,18 @@ def _limit_entries(
             limits.bounds[limit],
             limits.scale[limit],
         )
+        # Violations relative to the tolerance: above 1 they count.
         nominal, *others = (
             (getattr(curve.polynomials, name)[..., rows] - bound) / scale
             for curve in curves
         )
+        # The scale has the sign of the side of the limit.
         error = bounds[name][:, rows] / np.abs(scale)
+        # The worst of all curves: nominal plus error.
         possible = find_maximum(nominal + error, family.edges)
         for other in others:
             possible = find_maximum(other, family.edges, possible)
+        # What every curve violates at least: nominal minus error.
         certain = find_maximum(nominal - error, family.edges)[0]
         t = float(possible[2] * family.duration)
         margin = limits.margin_at(limit, possible, t)
@@ -321,6 +338,7 @@ def _limit_entries(
             getattr(curve.evaluate(np.array(possible[2:]), jerk=True), name)[joint, 0]
             for curve in curves
         ]
+        # The curves of both interpolations differ, which is an uncertainty, too.
         uncertainty = max(float(bounds[name][span, joint]), float(np.ptp(there)))
         at, *others = (
             (getattr(state, name)[rows].T - bound) / scale for state in states
@@ -345,6 +363,7 @@ def _measured_entries(context: EvaluationContext) -> list[ConditionDecision]:
     }
     certain, masks = {}, {}
     for condition in context.measured:
+        # Shares of time are measured at the samples, before the world moves.
         violated, possible = _violation_masks(context, condition)
         masks[id(condition)] = _share(violated, t), _share(possible & ~violated, t)
         certain[id(condition)] = float(_certain(context, condition).max())
@@ -358,6 +377,7 @@ def _measured_entries(context: EvaluationContext) -> list[ConditionDecision]:
         error = float(np.max(condition.uncertainty))
         worst[key] = max(worst[key], margin, key=lambda candidate: candidate.severity)
         if context.phase_of is not None or not condition.relaxation.any():
+            # As in ``_certain``: a violation includes the error once.
             certain[key] = max(
                 certain[key],
                 (margin.violation - 2 * error) / max(margin.tolerance, ZERO_TOLERANCE),
@@ -376,6 +396,8 @@ def _certain(context: EvaluationContext, condition: MeasuredCondition) -> Array:
     if context.phase_of is None:
         # Bounds are widest at some phase.
         excess = condition.relaxation.max() - condition.relaxation
+    # A violation includes the error once; subtracted twice, what every curve has is
+    # left.
     certain = condition.violation - 2 * condition.uncertainty - excess
     return np.asarray(
         certain / np.maximum(condition.tolerance, ZERO_TOLERANCE)[:, None]
@@ -391,6 +413,8 @@ def _violation_masks(
             pairs_of(context.world, condition.constraint),
             condition.condition.lower - condition.tolerance,
         )
+        # A distance below the bound by more than the error is too small for every
+        # curve.
         low = float(np.max(required - condition.uncertainty, initial=-np.inf))
         high = float(np.max(required + condition.uncertainty, initial=-np.inf))
         return ~pairs.clear_states(low), ~pairs.clear_states(high)
@@ -407,6 +431,7 @@ def _error_at(
     uncertainty = condition.uncertainty
     if isinstance(uncertainty, float):
         return uncertainty
+    # Between samples, the error of the nearest one is reported.
     k = int(np.abs(context.samples.s - margin.phase).argmin())
     return float(np.asarray(uncertainty)[:, k].max())
 

@@ -70,6 +70,7 @@ def refute(
     """Return the verdict on samples through which no curve within the joint limits leads; None if bounds refute none."""
     limits = judge.limits(trajectory.parameters)
     alone = replace(trajectory, dq=None, ddq=None)
+    # Bounds by positions alone come first: they hold whatever the velocities are.
     found = refuted_limits(limits, alone, errors)
     if found or trajectory.dq is None:
         found = found or _refuted_torques(judge, trajectory, errors, limits)
@@ -78,9 +79,11 @@ def refute(
     if not found:
         found = _refuted_torques(judge, trajectory, errors, limits)
         return _refutation(trajectory, found) if found else None
+    # Positions alone refute nothing: velocities are at fault, or both columns disagree.
     worst = next((each for each in found if each.samples == BOTH), found[0])
     if worst.samples not in {BOTH, VELOCITIES}:
         return _refutation(trajectory, found)
+    # A shift or a factor of the velocities may explain the contradiction.
     joint = limits.joints.index(worst.margin.part)
     text = explain_velocities(trajectory, errors, joint, limits.joints)
     if not text and worst.samples != BOTH:
@@ -126,6 +129,7 @@ def judge_samples(
         return TrajectoryVerdict(
             Decision.UNDECIDED, NO_JITTER_BOUND, duration=trajectory.duration
         )
+    # A controller connects positions that are so close by lines.
     if exact and _is_dense(trajectory):
         line = interpolated(trajectory, "linear", noise)
         smooth = through_positions(trajectory, SMOOTH_NEIGHBORS)
@@ -167,6 +171,7 @@ def acceleration_limits(
     ):
         quantity = quantity_of(constraint)
         if quantity in smallest:
+            # Limits of both signs may differ, and the curve uses one number for both.
             allowed = np.minimum(-bounds[:n], bounds[n:]) + tolerance_share * tolerance
             smallest[quantity] = np.minimum(
                 smallest[quantity], np.maximum(allowed, 0.0)
@@ -188,6 +193,8 @@ def _curves(
     exact: bool,
 ) -> Iterator[tuple[CurveFamily, float | None]]:
     """Yield curves within the errors of all samples, with the step at which they are judged."""
+    # Samples that resolve the motion determine one curve, which is tried before
+    # splines.
     if exact and is_resolved(trajectory, ends.acceleration):
         if trajectory.ddq is not None:
             yield family_of_data(trajectory.t, data_of(trajectory)), None

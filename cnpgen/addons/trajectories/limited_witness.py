@@ -83,8 +83,11 @@ def limited_witness(
         if limited is None:
             return None
         splines.append(limited)
+    # The programs meet errors up to their tolerance, so all samples are compared again.
     if not is_within(_JointSplines(splines), trajectory, errors):
         return None
+    # Between knots of any joint, every spline is one quintic. Its q, dq and ddq at both
+    # ends determine it exactly.
     times = np.unique(np.concatenate([spline.knots for spline in splines]))
     return family_of_data(times, _JointSplines(splines).at(times))
 
@@ -110,6 +113,8 @@ def _limited(
     for _ in range(MAX_WINDOWS):
         points = spline.points(t[0], t[-1])
         excess = np.abs(spline.at(points, 2)) - limit
+        # Each pass removes the worst excess; the window may leave others for the next
+        # pass.
         if excess.max() <= 0:
             return spline
         sample = int(np.searchsorted(t, points[excess.argmax()]))
@@ -169,11 +174,14 @@ class _Part:
         """Return the spline with the smallest jerks that meets the errors and the limit, or None."""
         import daqp
 
+        # The error of positions is the unit of the program, so its numbers are near
+        # one.
         free, unit = self.free, float(allowed[0])
         if not len(free):
             return None
         curvature, gradient = self._jerks(unit)
         rows, lower, upper = self._constraints(allowed, limit, unit)
+        # The Hessian has largest entries of 1, to which the regularization refers.
         scale = float(np.abs(curvature).max())
         solution: tuple[Any, ...] = daqp.solve(
             curvature / scale + SPLINE_REGULARIZATION * np.eye(len(free)),
@@ -187,6 +195,7 @@ class _Part:
         if solution[2] != 1:
             return None
         coefficients = self.spline.coefficients.copy()
+        # The program states changes in units, not the coefficients themselves.
         coefficients[free] += unit * np.array(solution[0])
         return _Spline(self.spline.knots, coefficients)
 
@@ -202,6 +211,7 @@ class _Part:
         groups.append((points, 2, np.zeros(len(points)), limit))
         rows, lower, upper = [], [], []
         for times, order, values, error in groups:
+            # The variables are changes: bounds are differences from the present curve.
             now = self.spline.at(times, order)
             factor = self.span**order / unit
             rows.append(self.rows(times, order))
@@ -215,8 +225,11 @@ class _Part:
         # Jerks are quadratic in every interval: exact with three nodes.
         nodes, weights = np.polynomial.legendre.leggauss(DEGREE - 2)
         spans = np.diff(inner)
+        # Gauss nodes x in [-1, 1] map to t = a + h (x + 1) / 2, with weights h w / 2.
         times = (inner[:-1, None] + spans[:, None] * (nodes + 1) / 2).ravel()
         strength = (spans[:, None] / self.span * weights / 2).ravel()
         third = self.rows(times, 3)
         now = self.spline.at(times, 3) * self.span**3 / unit
+        # With jerks j + R x, half the squared integral has the Hessian R^T W R and the
+        # gradient R^T W j.
         return third.T @ (strength[:, None] * third), third.T @ (strength * now)

@@ -73,6 +73,7 @@ def second_derivatives(
     e = with_rounding(y, error)
     for lag in _lags(len(t), 2):
         low, high = _mean_intervals(t, y, lag, e, jitter)
+        # The area of the hat over both spans.
         area = ((t[2 * lag :] - t[: -2 * lag]) / 2)[:, None]
         least, most = low[lag:] - high[:-lag], high[lag:] - low[:-lag]
         # A larger area makes the mean smaller, but never changes its sign.
@@ -99,6 +100,7 @@ def third_derivatives(t: Array, y: Array, error: float) -> Iterator[MeanDerivati
         count = len(t) - 3 * lag
         x = np.stack([t[k * lag :][:count] for k in range(4)])
         parts = np.stack([y[k * lag :][:count] for k in range(4)])
+        # The identity replaces the distance of a sample from itself by a factor of 1.
         distances = x[:, None] - x[None] + np.eye(4)[..., None]
         weights = 6 / distances.prod(axis=1)
         mean = np.einsum("km,kmn->mn", weights, parts)
@@ -124,9 +126,11 @@ def second_derivatives_with_velocities(
     for lag in _lags(len(t), 1):
         h = (t[lag:] - t[:-lag])[:, None]
         missing = q[lag:] - q[:-lag] - h * (dq[lag:] + dq[:-lag]) / 2
+        # What a motion with linear velocity between both samples lacks.
         m = np.maximum(np.abs(missing) - 2 * e - h * e_v, 0.0)
         c = np.maximum(np.abs(dq[lag:] - dq[:-lag]) - 2 * e_v, 0.0)
         least = (2 * m + np.sqrt(4 * m**2 + (h * c) ** 2)) / h**2
+        # The bound is one of |ddq|, whose sign is unknown: it holds for both signs.
         yield MeanDerivatives(least, -least, (t[lag:] + t[:-lag]) / 2)
 
 
@@ -142,6 +146,8 @@ def _mean_intervals(
     h, change = (t[lag:] - t[:-lag])[:, None], y[lag:] - y[:-lag]
     low, high = change - 2 * error, change + 2 * error
     largest, smallest = h + 2 * jitter, np.maximum(h - 2 * jitter, 1e-300)
+    # A change is smallest per time over the longest possible time, but its sign decides
+    # which time that is.
     with np.errstate(over="ignore"):
         return (
             np.where(low >= 0, low / largest, low / smallest),

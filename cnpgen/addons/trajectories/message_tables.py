@@ -85,6 +85,7 @@ def tables_of_document(
         UsageError: The document is none of them, or has an element that is not used
             and not in ``allow_unused``.
     """
+    # Every read of the document is counted, so elements that nobody read are found.
     account = Account(place, UNUSED_ELEMENTS, allow_unused=allow_unused)
     root = accounted({"": document}, account)
     tables = list(_tables(root[""], place))
@@ -108,6 +109,7 @@ def _tables(document: Any, place: str) -> Iterator[TrajectoryTable]:
         and document
         and all(isinstance(entry, dict) for entry in document)
     ):
+        # A stream of states is one trajectory; a list of other messages holds one each.
         if is_joint_state(document[0]):
             yield _table_of_states(document, place)
         elif any(key in document[0] for key in ("points", *_NESTING)):
@@ -196,6 +198,7 @@ def _table_of_states(messages: Sequence[Any], place: str) -> TrajectoryTable:
             raise UsageError(
                 f"{where}: joint {other!r} is not in every message; the first has {', '.join(names)}"
             )
+        # The order of joints may differ between messages.
         rows = [order.index(name) for name in names]
         header = message.get("header")
         stamp = header.get("stamp") if isinstance(header, dict) else None
@@ -209,6 +212,7 @@ def _table_of_states(messages: Sequence[Any], place: str) -> TrajectoryTable:
                     f"{where}.{key} must have {len(names)} values, one per joint"
                 )
             columns[column].append(_array(values, f"{where}.{key}")[rows])
+    # Differences of fractions are exact before they become float64.
     t = np.array([float(stamp - stamps[0]) for stamp in stamps])
     if len(t) > 1 and not t.any():
         raise UsageError(f"{place}: all stamps are equal: the messages have no times")
@@ -240,6 +244,7 @@ def _array(values: Any, place: str) -> Values:
         found = np.array(values)
     except ValueError as error:
         raise UsageError(f"{place}: its rows have different lengths") from error
+    # Ragged lists and objects would become arrays of type object.
     if found.dtype.kind not in "biufU":
         raise UsageError(f"{place}: expected numbers, got {values!r:.60}")
     return found
@@ -262,6 +267,7 @@ def _from_message(message: Mapping[str, Any], place: str) -> TrajectoryTable:
         columns[MESSAGE_TIME].append(float(stamp))
         for key, name in _POINT_FIELDS.items():
             values = point.get(key) or []
+            # Optional derivatives may be empty lists.
             if not values and name != "q" and not columns.get(name):
                 continue
             if not isinstance(values, list) or len(values) != len(names):
@@ -269,6 +275,7 @@ def _from_message(message: Mapping[str, Any], place: str) -> TrajectoryTable:
                 raise UsageError(
                     f"{where}.{key} must have {len(names)} values, one per joint, got {count}"
                 )
+            # A derivative that begins at a later point leaves earlier rows empty.
             if len(columns.setdefault(name, [])) != index:
                 raise UsageError(f"{where}.{key}: earlier points have none")
             mark_read(values)

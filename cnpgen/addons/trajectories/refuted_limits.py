@@ -65,6 +65,7 @@ def refuted_limits(
     """Return the joint limits that no curve through samples within their errors meets, worst first."""
     found: dict[int, tuple[float, RefutedLimit]] = {}
     largest = largest_values(limits)
+    # Bounds of quantities without a limit need not be computed.
     bounded = [quantity_of(constraint) for constraint in limits.constraints]
     for order, samples, condition, all_bounds in _bounds(trajectory, errors, largest):
         name = _ORDERS[order]
@@ -88,6 +89,8 @@ def largest_values(limits: ProvenJointLimits) -> dict[str, Array]:
         limits.constraints, limits.bounds, limits.tolerance, strict=True
     ):
         name = quantity_of(constraint)
+        # The larger side counts: the values bound how far a motion within limits can
+        # move.
         allowed = np.maximum(-bounds[:n], bounds[n:]) + tolerance
         largest[name] = np.minimum(largest[name], allowed)
     return largest
@@ -101,6 +104,7 @@ def _worst(
     values = np.concatenate([bounds.high, bounds.low], axis=1)
     with np.errstate(invalid="ignore", over="ignore"):
         relative = (values - limits.bounds[limit]) / limits.scale[limit]
+    # Joints without a limit and bounds that say nothing give inf or nan.
     relative = np.where(np.isfinite(relative), relative, -np.inf)
     k, row = np.unravel_index(int(relative.argmax()), relative.shape)
     time = float(bounds.t[k])

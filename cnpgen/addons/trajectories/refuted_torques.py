@@ -72,9 +72,12 @@ def refuted_torques(
         if not len(centres):
             continue
         states = _mean_states(t, q, centres, lag)
+        # Torques of the mean state: M(q_c) a + n(q_c, v_c).
         mean = torques(*states)
         share = (np.abs(mean) - allowed.tolerance) / allowed.limit
         worst = share.max(axis=1)
+        # Each remainder needs many evaluations of the dynamics, so only large torques
+        # get one.
         rows = np.argsort(-worst)[:MAX_CANDIDATES]
         rows = rows[worst[rows] > best]
         for row in rows.tolist():
@@ -118,6 +121,7 @@ def _refuted(  # noqa: PLR0917 - the parts of a margin
 
 def _centres(t: Array, lag: int) -> NDArray[np.intp]:
     """Return the samples at the center of two spans of about equal lengths."""
+    # The remainder holds for a hat with equal halves.
     centres = np.arange(lag, len(t) - lag)
     before, after = t[centres] - t[centres - lag], t[centres + lag] - t[centres]
     equal = np.abs(after - before) <= MAX_UNEQUAL * np.minimum(before, after)
@@ -128,6 +132,8 @@ def _mean_states(
     t: Array, q: Array, centres: NDArray[np.intp], lag: int
 ) -> tuple[Array, Array, Array]:
     """Return positions at the center, mean velocities and mean accelerations over hats, shape (M, n) each."""
+    # Divided differences: v_c = (q_2 - q_0) / (2 h), a = 2 (v_after - v_before) / (2
+    # h).
     first, last = centres - lag, centres + lag
     before, after = (
         (q[end] - q[start]) / (t[end] - t[start])[:, None]
@@ -146,17 +152,20 @@ def _remainder(
 ) -> Array:
     """Bound the difference of mean torques from those of the mean state, shape (n,)."""
     (q, v, _), (max_dq, max_ddq), n = state, largest, len(state[0])
+    # Bounds of |q - q_c| and |dq - v_c| on the mean over the hat, as in the module.
     fastest = np.minimum(max_dq, np.abs(v) + max_ddq * h)
     moved = error + fastest * h / 3
     faster = MEAN_VELOCITY_ERROR * max_ddq * h + error / h
     # Rows: the state, then every joint moved up and down, then every velocity.
     offsets = np.concatenate([np.zeros((1, n)), np.diag(moved), -np.diag(moved)])
     still, units = np.zeros_like(offsets), np.eye(n)
+    # With ddq = 0, inverse dynamics are n(q, v).
     fixed = torques(q + offsets, v + still, still)
     # Column k of M at every row, shape (n, rows, n).
     masses = np.stack(
         [torques(q + offsets, still + v, still + unit) - fixed for unit in units]
     )
+    # Positions stay while every velocity moves up and down.
     speeds = np.concatenate([np.diag(faster), -np.diag(faster)])
     by_speed = torques(q + 0 * speeds, v + speeds, 0 * speeds) - fixed[0]
 
@@ -166,8 +175,10 @@ def _remainder(
         both = np.maximum(size[..., :n, :], size[..., n:, :])
         return np.asarray(both.sum(axis=-2))
 
+    # Changes of M are multiplied by the largest ddq.
     of_mass = np.einsum("kj,k->j", change(masses[:, 1:] - masses[:, :1]), max_ddq)
     estimated = of_mass + change(fixed[1:] - fixed[0]) + change(by_speed)
+    # The error 4 e / h^2 of the mean of ddq acts through |M|.
     return np.asarray(
         CURVATURE_FACTOR * estimated
         + np.abs(masses[:, 0]).sum(axis=0) * 4 * error / h**2

@@ -58,6 +58,7 @@ class _Polynomials:
         coefficients = np.einsum(
             "scw,swn->csn", differentiated(self.weights, order), self.data
         )
+        # Basis polynomials B_k(u) = C(d, k) u^k (1 - u)^(d - k).
         degree, u = len(coefficients) - 1, COMPARED_PHASES[:, None]
         k = np.arange(degree + 1)
         basis = (
@@ -93,6 +94,8 @@ def resolved_curves(
         accurate, other = (
             _through_positions(trajectory, size, noise) for size in WINDOWS
         )
+        # Limits of accelerations bound the distance of a motion from lines between
+        # positions.
         chord = _hermite(h, data[:1], noise)
     else:
         accelerations = (
@@ -106,6 +109,8 @@ def resolved_curves(
             # Which estimated accelerations amplify.
             accurate, other = chord, accurate
     resolution = [
+        # The difference of both interpolations estimates the error of the less accurate
+        # one.
         np.abs(accurate.values(order) - other.values(order)).max(axis=0)
         for order in range(3)
     ]
@@ -138,6 +143,7 @@ def is_resolved(trajectory: Trajectory, max_acceleration: Array) -> bool:
         if trajectory.ddq is None
         else trajectory.ddq
     )
+    # A joint without a limit is compared with its own largest acceleration.
     scale = np.where(
         np.isfinite(max_acceleration), max_acceleration, np.abs(accurate).max(axis=0)
     )
@@ -175,6 +181,7 @@ def _unresolved_spans(
     errors: Array, max_acceleration: Array, *, ends: bool
 ) -> NDArray[np.bool_]:
     """Return a mask of the spans with large errors of accelerations, and of those at the ends, shape (S, n)."""
+    # The negation counts nan as unresolved. Without a limit, any error is too large.
     mask = ~(
         errors
         <= MAX_RESOLVED_ERROR
@@ -200,9 +207,13 @@ def _errors_within(
     limit = np.where(
         np.isfinite(max_acceleration), LIMIT_FACTOR * max_acceleration, UNDEFINED
     )
+    # Motion and chord agree at both ends. The second derivative of their difference is
+    # at most B, the limit plus the acceleration of the chord.
     largest = limit + np.abs(chord.values(2)).max(axis=0)
+    # A chord through velocities, too, agrees in the derivative at both ends.
     share = 0.5 if chord.weights.shape[2] > 2 else 1.0
     free = share * largest * (h**2 / 8 if order == 0 else h / 2)
+    # Triangle inequality: from the polynomial to the chord, and to the motion.
     return np.asarray(
         np.abs(accurate.values(order) - chord.values(order)).max(axis=0) + free
     )

@@ -94,10 +94,12 @@ def rounding(columns: Array) -> tuple[str, float]:
 
     Columns of one value alone show nothing. Angles may be rounded in radians or degrees.
     """
+    # Constant columns have few decimals by chance.
     moving = columns[:, np.ptp(columns, axis=0) > 0]
     if not moving.size:
         return "", 0.0
     single, half_spacing = "", 0.0
+    # Decimals of radians are tried before those of degrees.
     for unit, name in ((1.0, ""), (DEGREE, " of a degree")):
         values = columns / unit
         spacing = _float32_spacing(values)
@@ -107,6 +109,7 @@ def rounding(columns: Array) -> tuple[str, float]:
             return f"{_counted(decimals)}{name}", half
         if spacing and not single:
             single, half_spacing = "the precision of float32", spacing / 2 * unit
+    # All moving joints must show the steps of an encoder.
     steps = [_step(column) for column in moving.T]
     known = [step for step in steps if step is not None]
     if known and len(known) == len(steps):
@@ -122,6 +125,7 @@ def time_rounding(t: Array) -> tuple[str, float]:
     # The last step of a motion is often shorter.
     steps = np.diff(t)[:-1]
     spacing = _float32_spacing(t[:, None])
+    # Equal steps up to rounding are computed times.
     if not len(steps) or np.ptp(steps) <= 2 * spacing + 1e-12:
         return "", 0.0
     decimals = _decimals(t[:, None], spacing)
@@ -150,6 +154,7 @@ def _decimals(values: Array, spacing: float) -> int | None:
     """
     for decimals in range(EXACT_DECIMALS):
         unit = 10.0**-decimals
+        # A unit near the spacing of float32 is no sign of rounded decimals.
         if unit < 64 * spacing:
             return None
         units = values / unit
@@ -162,11 +167,13 @@ def _decimals(values: Array, spacing: float) -> int | None:
 def _step(column: Array) -> float | None:
     """Return the step of an encoder: the smallest change, if all others are multiples of it."""
     changes = np.abs(np.diff(column))
+    # Differences between levels show the step where fast joints skip levels.
     levels = np.diff(np.unique(column))
     changes = np.concatenate([changes, levels])
     changes = changes[changes > 1e-9]
     if len(changes) < MIN_STEPS:
         return None
+    # The median of changes near the smallest one averages their rounding.
     step = float(np.median(changes[changes < 1.5 * changes.min()]))
     counts = changes / step
     regular = np.abs(counts - np.round(counts)) < STEP_TOLERANCE

@@ -104,6 +104,7 @@ class Trajectory:
         """
         if self.phase is None:
             return None
+        # Pchip keeps phases monotonic between samples, which cubic splines do not.
         from scipy.interpolate import PchipInterpolator
 
         interpolator = PchipInterpolator(self.t / self.duration, self.phase)

@@ -69,6 +69,7 @@ def smooth_curve(
     for sign in (1.0, -1.0):
         flip = slice(None, None, int(sign))
         reversed_t = t if sign > 0 else t[-1] - t[::-1]
+        # A reversed time changes the sign of the odd derivatives, velocity and jerk.
         samples = [
             reversed_t,
             q[flip],
@@ -85,12 +86,15 @@ def smooth_curve(
             return None
         ends.append(end)
     first, last = ends
+    # The reversed end returns to the time of the motion: t = T - tau, and dq changes
+    # its sign.
     mirrored = [t[-1] - last[0][::-1], last[1][::-1], -last[2][::-1], last[3][::-1]]
     inner_samples = slice(END_SPANS + 1, len(t) - END_SPANS - 1)
     parts = [
         np.concatenate([start, values[inner_samples], end])
         for start, values, end in zip(first, (t, q, dq, inner), mirrored, strict=True)
     ]
+    # Knots closer than the rounding of times would enclose a span without length.
     kept = np.diff(parts[0], prepend=-1.0) > MIN_STEP_S
     return family_of_data(parts[0][kept], [values[kept] for values in parts[1:]])
 
@@ -101,21 +105,30 @@ def estimated_derivative(trajectory: Trajectory, order: int, neighbors: int) -> 
     if dq is None:
         raise UsageError("an estimate of derivatives needs samples with velocities")
     size, count = min(neighbors, len(t)), len(t)
+    # The window of a sample is centered on it, and shifted inward near both ends.
     first = np.clip(np.arange(count) - size // 2, 0, count - size)
     window = first[:, None] + np.arange(size)
+    # Phases x = (t - t_k) / scale in [-1, 1] keep the powers of x near one.
     scale = t[window[:, -1]] - t[window[:, 0]]
     x = (t[window] - t[:, None]) / scale[:, None]
     powers = np.arange(2 * size)
+    # The polynomial sum_i c_i x^i meets q and dq at all samples of the window
+    # (Hermite).
     values = x[:, :, None] ** powers
     derivatives = powers * x[:, :, None] ** np.maximum(powers - 1, 0)
+    # A constant has no derivatives: differences from the own position lose fewer
+    # digits.
     data = np.concatenate(
         [q[window] - q[:, None], dq[window] * scale[:, None, None]], axis=1
     )
+    # At x = 0 the derivative is order! c_order. The weights w solve A^T w = wanted, so
+    # w times the data is this derivative.
     wanted = np.zeros((count, 2 * size, 1))
     wanted[:, order] = factorial(order)
     weights = np.linalg.solve(
         np.concatenate([values, derivatives], axis=1).swapaxes(1, 2), wanted
     )[..., 0]
+    # Phases are shares of the scale, so derivatives by time need a factor scale^-order.
     return np.asarray(np.einsum("kw,kwn->kn", weights, data) / scale[:, None] ** order)
 
 
@@ -143,6 +156,8 @@ def _end(
         if column is None:
             return None
         columns.append(column)
+    # Linear accelerations over a step d change dq by d (a_k + a_k+1) / 2. They change q
+    # by d dq + d^2 (a_k / 3 + a_k+1 / 6).
     accelerations, step = np.stack(columns, axis=1), np.diff(knots)[:, None]
     velocities = dq[0] + _sums(step * (accelerations[1:] + accelerations[:-1]) / 2)
     moves = velocities[:-1] * step + step**2 * (
@@ -185,10 +200,14 @@ class _EndProgram:
     def at(cls, t: Array, knots: Array, *, given: bool) -> "_EndProgram":
         """Return the program for samples at times t and knots between them, both ascending from 0."""
         steps, size, h = np.diff(knots), len(knots), np.diff(t)
+        # The small shift finds the knot of a sample in spite of rounding.
         at_samples = np.searchsorted(knots, t - MIN_STEP_S)
         velocity, position = np.zeros((len(h), size)), np.zeros((len(h), size))
         for span in range(len(h)):
             for k in range(at_samples[span], at_samples[span + 1]):
+                # A linear acceleration over a step d changes dq by d (a_k + a_k+1) / 2.
+                # With r from knot k to the end of the span, q changes by
+                # d r (a_k + a_k+1) / 2 - d^2 (a_k / 6 + a_k+1 / 3).
                 rest = t[span + 1] - knots[k]
                 velocity[span, k : k + 2] += steps[k] / 2
                 position[span, k : k + 2] += steps[k] * np.array(
@@ -199,13 +218,19 @@ class _EndProgram:
         # And the difference from the given jerk.
         changes = np.concatenate([np.diff(jerks, axis=0), jerks[-1:]])
         width = np.append((steps[1:] + steps[:-1]) / 2, steps[-1])
+        # Squares of changes of jerk divided by their widths sum to an integral. Their
+        # weight grows with the time from the end, so the acceleration may change
+        # fastest there.
         weight = (MIN_SMOOTHNESS + knots[1:] / h[0]) ** 2 * np.sqrt(h[0] ** 3 / width)
         weighted = changes * weight[:, None]
         curvature, gradient = weighted.T @ weighted, weight[-1] * weighted[-1]
+        # A constant acceleration has no cost: only the regularization makes the Hessian
+        # positive definite.
         scale = float(np.abs(curvature).max())
         return cls(
             curvature / scale + REGULARIZATION * np.eye(size),
             gradient / scale,
+            # Rows have the unit of accelerations, whatever the spacing of samples.
             np.concatenate([velocity / h[:, None], position / h[:, None] ** 2, known]),
             jerks,
             h,
@@ -221,14 +246,17 @@ class _EndProgram:
         """
         import daqp
 
+        # What the accelerations of a span must add to the motion at constant dq.
         moved = (q[1:] - q[:-1] - dq[:-1] * self.h) / self.h**2
         known = ddq if self.given else ddq[-1:]
         target = np.concatenate([np.diff(dq) / self.h, moved, known])
+        # DAQP takes 1e30 as infinity.
         size, (largest, steepest) = (
             len(self.curvature),
             (min(bound, 1e30) for bound in bounds),
         )
         rows = self.equalities
+        # The first N bounds of DAQP are those of the variables; rows follow.
         high = [np.full(size, largest), target]
         low = [np.full(size, -largest), target]
         if np.isfinite(bounds[1]):
@@ -246,4 +274,5 @@ class _EndProgram:
             sense,
             primal_tol=END_PROGRAM_TOLERANCE,
         )
+        # An exit flag of 1 is an optimum within the tolerance.
         return np.array(solution[0]) if solution[2] == 1 else None

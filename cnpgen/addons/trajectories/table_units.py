@@ -76,6 +76,8 @@ def check_units(
         unit
         for unit, factor in TIME_UNITS.items()
         if step * factor >= MIN_SAMPLING_PERIOD_S
+        # Shorter times make the joints faster than they seem in seconds, by the same
+        # factor.
         and 0 < speed / factor <= MAX_SPEED_RATIO
     ]
     if possible:
@@ -92,6 +94,7 @@ def check_units(
 
 def _speed_ratio(trajectory: Trajectory, velocity_limit: Array) -> float:
     """Return the speed of most moving spans, relative to the velocity limits of the joints."""
+    # Times in the stated numbers; other units scale all speeds alike.
     speeds = np.abs(np.diff(trajectory.q, axis=0)) / np.diff(trajectory.t)[:, None]
     ratios = (speeds / velocity_limit).max(axis=1)
     moving = ratios[ratios > 0]
@@ -102,6 +105,8 @@ def _ratio_of_velocities(trajectory: Trajectory) -> float | None:
     """Return the way of the positions over that of the velocities; 1 in SI units, None if it cannot be computed."""
     if trajectory.dq is None or len(trajectory.t) < MIN_VELOCITY_SAMPLES:
         return None
+    # Ways are sums over joints and spans, so noise of a single difference matters
+    # little.
     way = np.abs(np.diff(trajectory.q, axis=0)).sum()
     mean = np.abs(trajectory.dq[1:] + trajectory.dq[:-1]) / 2
     integral = (mean * np.diff(trajectory.t)[:, None]).sum()

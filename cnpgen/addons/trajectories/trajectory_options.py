@@ -157,22 +157,22 @@ def load_file(
 
 
 def write_json(
-    file: Path, found: "TrajectoryEvaluation", labels: tuple[str, ...]
+    file: Path, loaded: "LoadedTrajectories", found: "TrajectoryEvaluation"
 ) -> None:
-    """Write all verdicts as JSON."""
+    """Write all verdicts, and what was not used of the file, as JSON."""
     rows = [
         {"trajectory": index, "place": label, **verdict.to_dict()}
         for index, (label, verdict) in enumerate(
-            zip(labels, found.verdicts, strict=True)
+            zip(loaded.labels, found.verdicts, strict=True)
         )
     ]
-    print(
-        json.dumps(
-            {"file": str(file), **found.summary(), "verdicts": rows},
-            indent=2,
-            ensure_ascii=False,
-        )
-    )
+    document = {
+        "file": str(file),
+        "unused": list(loaded.ignored),
+        **found.summary(),
+        "verdicts": rows,
+    }
+    print(json.dumps(document, indent=2, ensure_ascii=False))
 
 
 def summary_text(file: Path, found: "TrajectoryEvaluation") -> str:

@@ -48,11 +48,17 @@ def along_trajectory(
     samples: int = PLOT_SAMPLES,
     extra_times: Sequence[float] = (),
 ) -> tuple[PathWorld, Array, Array, Scene]:
-    """Place the robot along a trajectory as ``along``, among obstacles by its ends, which are returned, too."""
+    """Place the robot along a trajectory as ``along``, among obstacles by its ends, which are returned, too.
+
+    Accelerations and jerks of positions alone are nan: a line between samples has none.
+    """
     t = plot_times(trajectory.duration, samples, extra_times)
     share, phase_of = t / trajectory.duration, trajectory.phase_of()
     q, dq, ddq = (np.ascontiguousarray(values.T) for values in trajectory.states(t))
     jerk = np.ascontiguousarray(trajectory.jerks(t).T) if problem.uses_jerk else None
+    if trajectory.dq is None:
+        ddq = np.full_like(q, np.nan)
+        jerk = None if jerk is None else ddq
     world = PathWorld(robot, problem.obstacle, problem.object_size)
     world.set_path(q, dq, ddq, place_obstacles(problem.obstacle), jerk)
     tip, velocity = world.tip_position.T, world.tip_velocity.T

@@ -39,8 +39,11 @@ class Uncertainty:
     def add(self, condition: MeasuredCondition, s: Array) -> MeasuredCondition:
         """Return a condition at phases s, shape (K,), with the error of its values."""
         error = self.errors[_key(condition)]
+        # One error of all times; an error of 0 leaves the condition as it is.
         if isinstance(error, float):
             return replace(condition, uncertainty=error) if error else condition
+        # Errors are measured at the middle of blocks. The largest of a block and both
+        # neighbors covers the times between.
         block = np.searchsorted(self.s, s, "right") - 1
         near = [np.clip(block + step, 0, len(self.s) - 1) for step in (-1, 0, 1)]
         return replace(
@@ -69,8 +72,10 @@ def uncertainty_of(  # noqa: PLR0917 - the family, and everything that measures 
     The first scene has the poses and sizes of the nominal curve, shape (width,); others
     are possible ones.
     """
+    # No point of the robot moves farther than sum_j reach_j |dq_j| for changes of q.
     reach = world.motion_bounds(family.max_positions())
     displacement = float((family.bounds[0] @ reach).max())
+    # Both ends place obstacles; the tip at the start relaxes bounds.
     ends = family.bounds[0][[0, -1]] @ reach
     placed = (
         float(ends.max())
@@ -116,6 +121,7 @@ def _friction_changes(
     if drive is None or not is_torque or not parts:
         return 0.0
     dq, error = family.evaluate(s, jerk=False).dq, family.bounds_at(s)[1]
+    # Rows of a condition may be some joints only.
     joints = [world.robot.joint_names.index(part) for part in parts]
     nominal = friction_bounds(drive, dq)
     moved = [friction_bounds(drive, dq + sign * error) for sign in (-1, 1)]
@@ -124,6 +130,7 @@ def _friction_changes(
         for ends in moved
         for other, bound in zip(ends, nominal, strict=True)
     ]
+    # Friction enters the power times the velocity.
     if condition.condition.unit == POWER_UNIT:
         changes = [change * (np.abs(dq) + error)[joints] for change in changes]
     return np.asarray(np.maximum.reduceat(np.max(changes, axis=0), starts, axis=1))
@@ -139,6 +146,7 @@ def _changes(  # noqa: PLR0917 - as of uncertainty_of
     starts: NDArray[np.intp],
 ) -> list[Array]:
     """Bound the errors of smooth conditions in every block, shape (m, B) each."""
+    # Twice the middle of every block.
     centers = np.append(starts[1:], len(s)) + starts
     at = s[centers // 2]
     states = [
@@ -146,6 +154,7 @@ def _changes(  # noqa: PLR0917 - as of uncertainty_of
         for values in vars(family.evaluate(at, jerk=problem.uses_jerk)).values()
         if values is not None
     ]
+    # The largest bound of a block applies to its middle.
     bounds = [
         np.maximum.reduceat(values, starts, axis=1)
         for values in family.bounds_at(s)[: len(states)]
@@ -172,6 +181,8 @@ def _changes(  # noqa: PLR0917 - as of uncertainty_of
     still = [np.zeros_like(state) for state in states]
     nominal = values(still)
     total = [np.zeros_like(g) for g in nominal]
+    # First-order effects: each value moves alone, in both directions, and changes add
+    # up.
     for order, bound in enumerate(bounds):
         for joint in np.flatnonzero(bound.any(axis=1)).tolist():
             changes = []
@@ -188,6 +199,7 @@ def _changes(  # noqa: PLR0917 - as of uncertainty_of
                 row + np.maximum(low, high)
                 for row, low, high in zip(total, *changes, strict=True)
             ]
+    # Only one of the scenes is the true one: changes by scenes are not summed.
     of_scenes = [np.zeros_like(g) for g in nominal]
     for scene in scenes[1:]:
         differences = [
@@ -201,10 +213,13 @@ def _changes(  # noqa: PLR0917 - as of uncertainty_of
         row + SCENE_FACTOR * change
         for row, change in zip(total, of_scenes, strict=True)
     ]
+    # A fixed seed gives equal verdicts for equal samples.
     random = np.random.default_rng(0)
     for _ in range(COMBINATIONS):
         offsets = [bound * random.choice([-1.0, 1.0], bound.shape) for bound in bounds]
         for row, g, g0 in zip(total, values(offsets), nominal, strict=True):
+            # Effects of several values may exceed the sum of single ones where they
+            # interact.
             np.maximum(row, np.abs(g - g0), out=row)
     return [
         CURVATURE_FACTOR * np.where(np.isfinite(row), row, UNDEFINED) for row in total

@@ -94,12 +94,14 @@ def fitted(
     """Return the splines with the largest weights whose differences are within the errors."""
     data, t = data_of(trajectory), trajectory.t
     allowed = np.maximum(errors.values, MIN_ERRORS)[: len(data)]
+    # A value measured within d of its time differs by at most its rate times d.
     rates = [np.abs(np.gradient(values, t, axis=0)) for values in data]
     limits = [
         e + jitter_share * errors.t * rate
         for e, rate in zip(allowed, rates, strict=True)
     ]
     equations = _equations(t, data, allowed)
+    # Columns of joints without a solution stay nan.
     chosen = np.full((len(equations.right), trajectory.q.shape[1]), np.nan)
 
     def keep(exponent: float, candidates: NDArray[np.bool_]) -> NDArray[np.bool_]:
@@ -119,12 +121,15 @@ def fitted(
         return np.asarray(close & candidates)
 
     at = np.full(chosen.shape[1], np.nan)  # exponents
+    # Weights fall by powers of ten. The first one that keeps a joint within its errors
+    # is the smoothest of them.
     for exponent in EXPONENTS:
         at[keep(exponent, np.isnan(at))] = exponent
         if not np.isnan(at).any():
             break
     if np.isnan(at).any():
         return None
+    # Half a power more is tried once; a joint that fails keeps its solution.
     for exponent in np.unique(at):
         keep(exponent + REFINED, at == exponent)
     return _Splines(equations.knots, chosen)
@@ -135,9 +140,13 @@ def _equations(t: Array, data: list[Array], errors: Array) -> _NormalEquations:
     from scipy.interpolate import BSpline
 
     h = t[-1] / (len(t) - 1)
+    # With m columns, inner knots have the multiplicity m: about one coefficient for
+    # each value, so that errors of exact samples can vanish.
     inner = np.repeat(t[1:-1], len(data))
     knots = np.concatenate([[t[0]] * (DEGREE + 1), inner, [t[-1]] * (DEGREE + 1)])
     scaled, times = knots / h, t / h
+    # The last sample must not lie beyond the last knot by rounding, where the basis
+    # ends.
     times[-1] = scaled[-1]
     # Rows of derivatives are those of lower degree times differences of coefficients.
     rows, total, right = np.eye(1), 0.0, 0.0
@@ -147,12 +156,15 @@ def _equations(t: Array, data: list[Array], errors: Array) -> _NormalEquations:
             times, scaled[order : len(scaled) - order], DEGREE - order
         )
         rows = basis if difference is None else basis @ difference
+        # Differences count in units of their errors, and those of positions have weight
+        # 1.
         weight = (errors[0] / (errors[order] * h**order)) ** 2
         total = total + weight * (rows.T @ rows)
         right = right + weight * (rows.T @ (values * h**order))
         difference = _difference(scaled, order, difference)
     for order in range(len(data), 3):
         difference = _difference(scaled, order, difference)
+    # Squared jerks have degree 4 in a span: three Gauss nodes integrate them exactly.
     nodes, weights = np.polynomial.legendre.leggauss(DEGREE - 2)
     spans = np.diff(times)
     points = (times[:-1, None] + spans[:, None] * (nodes + 1) / 2).ravel()
@@ -169,6 +181,8 @@ def _difference(knots: Array, order: int, before: Any) -> Any:
     size = len(knots) - DEGREE - 1 - order
     inner = knots[order : len(knots) - order]
     degree = DEGREE - order
+    # Coefficients of the derivative: c'_i = p (c_i+1 - c_i) / (t_i+p+1 - t_i+1), with
+    # the degree p.
     scale = degree / (inner[degree + 1 : degree + size] - inner[1:size])
     matrix = diags_array(
         (-scale, scale), offsets=(0, 1), shape=(size - 1, size)
@@ -189,10 +203,12 @@ def is_within(
 ) -> bool:
     """Return whether splines meet every sample within its errors at one time within the jitter."""
     t, data = trajectory.t, data_of(trajectory)
+    # The relative share is for rounding in the evaluation of splines.
     allowed = np.maximum(errors.values, MIN_ERRORS) * (1 + 1e-9)
     met = np.zeros(len(t), bool)
     for offset in np.linspace(-1, 1, JITTER_PARTS if errors.t else 1):
         shift = offset * errors.t if errors.t else 0.0
+        # All values of a sample must be met at one time, not each at its own.
         values = splines.at(np.clip(t + shift, t[0], t[-1]))
         close = [
             (np.abs(value - given) <= limit).all(axis=1)

@@ -89,6 +89,8 @@ def planned_joints(robot: Robot) -> tuple[list[dict[str, Any]], list[float]]:
     for index, name in enumerate(robot.joint_names):
         placement = model.jointPlacements[index + 1]
         # Linear, then angular.
+        # The logarithm of the motion from its placement, per unit of displacement, is
+        # the twist of a joint.
         twist = pin.log6(placement.actInv(data.liMi[index + 1])).vector / PROBE
         joints.append(
             {
@@ -111,6 +113,7 @@ def wrapped(
     name: str, joint: int, corners: Array, radius: float, *, smooth: bool = False
 ) -> Body:
     """Return the hull of points [m], shape (V, 3), inflated by a radius [m], as triangles that face outwards."""
+    # The hull of balls around all points is the inflated hull.
     points = (corners[:, None] + radius * _ball()).reshape(-1, 3) if radius else corners
     used, numbers = np.unique(outward_triangles(points), return_inverse=True)
     return Body(name, joint, points[used], numbers.reshape(-1, 3), smooth)
@@ -122,12 +125,14 @@ def tube(name: str, points: Array, radius: float) -> Body:
     along /= np.maximum(np.linalg.norm(along, axis=1, keepdims=True), 1e-12)
     across = np.cross(along, [0.0, 0.0, 1.0])
     level = np.linalg.norm(across, axis=1, keepdims=True)
+    # A vertical tangent has no horizontal normal, so x takes its place.
     across = np.where(level > 1e-3, across / np.maximum(level, 1e-12), [1.0, 0.0, 0.0])
     angles = np.arange(6) * np.pi / 3
     ring = (
         np.cos(angles)[:, None] * across[:, None]
         + np.sin(angles)[:, None] * np.cross(along, across)[:, None]
     )
+    # Two triangles fill each side between two rings of six corners.
     first = [
         (6 * k + i, 6 * k + (i + 1) % 6, 6 * k + 6 + i)
         for k, i in product(range(len(points) - 1), range(6))
@@ -151,6 +156,8 @@ def extent(bodies: Sequence[Body], poses: Array) -> tuple[Array, Array]:
 def _ball() -> Array:
     """Unit vectors along meridians and parallels, shape (N, 3)."""
     angles = np.linspace(0, np.pi, 2 * BALL + 1)
+    # Meridians include both poles; around the circle, the last turn would repeat the
+    # first.
     turns = np.arange(4 * BALL) * np.pi / (2 * BALL)
     level, height = (
         np.sin(angles)[:, None],

@@ -143,6 +143,7 @@ def scene_of_trajectories(
             else replace(entry.margin, violation=NOT_MEASURED)
             for name, entry in verdict.conditions.items()
         }
+        # Violations between the frames get frames of their own.
         extra = [margin.time for margin in margins.values() if not margin.ok]
         with np.errstate(all="ignore"):
             world, s, times, scene = along_trajectory(
@@ -202,14 +203,19 @@ def _moving(  # noqa: PLR0917 - all of them are shown
         labels=[f"{time:.3f} s" for time in times],
         times=times.tolist(),
         q=world.q.T,
+        # Three.js reads matrices by columns.
         poses=poses.swapaxes(2, 3),
         world=list(_world(problem, scene)),
         path=[tube("path of the tip", poses[:, -1, :3, 3], TIP_PATH_RADIUS_M)],
         curves=[
             {"name": name, "shares": share.round(SHARE_DIGITS).tolist()}
             for name, share in shares.items()
+            # Of positions alone, accelerations and torques are nan.
+            if np.isfinite(share).any()
         ],
-        conditions=[_condition(curve) for curve in curves],
+        conditions=[
+            _condition(curve) for curve in curves if np.isfinite(curve.values).any()
+        ],
         verdict=_verdict(verdict, curves, times, poses, robot.joint_names),
     )
 
@@ -230,6 +236,7 @@ def _verdict(
     margins = sorted(verdict.margins.values(), key=lambda margin: -margin.severity)
     causes = []
     for margin in margins:
+        # The nearest frame shows the margin.
         frame = int(np.abs(times - margin.time).argmin())
         point = _point(
             margin, by_name.get(margin.name), poses[frame], frame, joints
@@ -325,6 +332,7 @@ def _scene(
         if contact is None
         else _disc_corners(np.zeros(3), contact.mallet_radius, MALLET_HEIGHT_M)
     )
+    # The index after the last joint is that of the tip.
     held = [] if size is None else [wrapped("object", tip, CUBE * np.array(size), 0.0)]
     joints, placement = planned_joints(robot)
     low, high = extent((*bodies, *held), views[0].poses[[0, -1]])
@@ -364,6 +372,7 @@ def _poses(robot: Robot, q: Array) -> Array:
             position.T,
         )
     poses[..., 3, 3] = 1.0
+    # The pose of the tip is that of the last joint times a fixed placement.
     poses[:, -1] = (
         poses[:, n] @ robot.model.frames[robot.tip_frame].placement.homogeneous
     )
@@ -377,6 +386,8 @@ def _world(problem: Problem, scene: Scene) -> Iterator[Body]:
             # The plan has fewer obstacles than the problem.
             continue
         if obstacle.upright and obstacle.height is None:
+            # Obstacles without a lower end are drawn from the floor, or from below
+            # their top.
             bottom = min(0.0, solid.high[2] - MIN_DRAWN_HEIGHT_M)
             yield wrapped(
                 obstacle.name,

@@ -13,7 +13,7 @@ from cnpgen.addons.init import link_overlaps
 from cnpgen.addons.init.arm import read_arm
 from cnpgen.addons.init.initial_recipes import INITIAL_JERK_RATE, problem_of
 from cnpgen.addons.init.write import toml
-from cnpgen.cli.describe_keys import part_of
+from cnpgen.addons.manual.describe_keys import part_of
 from cnpgen.cli.main import main
 from cnpgen.make.recipe import load_dataset_recipe
 from cnpgen.problems.constraints.joint import JointJerk

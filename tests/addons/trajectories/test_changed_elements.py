@@ -10,6 +10,7 @@ import h5py
 import numpy as np
 import pytest
 
+from cnpgen.cli.main import main
 from cnpgen.errors import UsageError
 from cnpgen.trajectories import LoadOptions, load_trajectories
 from tests.addons.trajectories.test_table_columns import BACKWARDS, DQ, Q, T
@@ -253,3 +254,13 @@ def test_positions_of_joints_that_are_not_planned(tmp_path: Path) -> None:
     (folder / "held_joints.yaml").write_text('"joint_7": 0.2\n')
     with pytest.raises(UsageError, match=r"'joint_7' is held at 0\.2"):
         load_trajectories(folder, "airhockey")
+
+
+def test_the_json_of_a_verdict_names_what_was_not_used(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = tmp_path / "message.json"
+    path.write_text(json.dumps(MESSAGE | {"velocity_scaling": 0.5}), encoding="utf-8")
+    words = ["evaluate", str(path), "--problem", "airhockey", "--json"]
+    assert main([*words, "--allow-unused", "velocity_scaling"]) in {0, 1}
+    assert "velocity_scaling" in json.loads(capsys.readouterr().out)["unused"]

@@ -686,6 +686,7 @@ def test_a_browser_shows_the_verdict_without_an_error(rejected, width):
     assert reddish.mean() > 0.003  # the badge and the violated conditions
 
 
+@needs_meshcat
 def test_conditions_that_samples_do_not_determine_have_no_number(tmp_path):
     path = tmp_path / "a.csv"
     t = np.arange(0, 0.6001, 0.01)
@@ -705,6 +706,9 @@ def test_conditions_that_samples_do_not_determine_have_no_number(tmp_path):
         "joint torque",
     ]
     assert not any("e+0" in text for text in texts.values())
+    assert [curve["name"] for curve in page["curves"]] == ["position", "velocity"]
+    drawn = {curve["name"] for curve in page["conditions"]}
+    assert not any("acceleration" in name or "torque" in name for name in drawn)
 
 
 @needs_meshcat

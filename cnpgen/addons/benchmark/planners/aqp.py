@@ -120,6 +120,7 @@ class _Follower:
         """Follow both parts; return None if a quadratic program has no solution."""
         from scipy.interpolate import CubicSpline
 
+        # A whole number of periods ends with the hit.
         count = max(int(np.ceil(hit.duration / SAMPLE_PERIOD_S)), 2)
         period = hit.duration / count
         samples = np.array([*hit.sampled(period), *stop.sampled(period)])
@@ -135,9 +136,12 @@ class _Follower:
             )
             if next_dq is None:
                 return None
+            # Velocities change linearly in a period, so their mean counts.
             q.append(q[-1] + (dq + next_dq) / 2 * period)
             dq = next_dq
         spline = CubicSpline(t, np.array(q), bc_type="clamped")
+        # The part after the hit determines the spline's velocity there, and is not
+        # sent.
         until = slice(0, count + 1)
         return Trajectory(t[until], np.array(q)[until], np.asarray(spline(t, 1))[until])
 
@@ -160,8 +164,11 @@ class _Follower:
         """Return the joint velocity that moves the tip to the sample, closest to the velocity of the anchor."""
         robot, (tip, _, J) = self._robot, self._tip.at(q)
         J = J[:3]
+        # Velocity of minimum norm: J^T (J J^T)^-1 v.
         min_norm = J.T @ np.linalg.solve(J @ J.T, (position - tip) / period)
+        # The right singular vectors beyond the rank of 3 span the null space.
         null = np.linalg.svd(J)[2][3:].T
+        # The velocity that reaches a position limit within one period is a bound, too.
         low = np.maximum(
             -robot.velocity_limit,
             (JOINT_LIMIT_FRACTION * robot.position_lower - q) / period,
@@ -194,6 +201,7 @@ def nearest_in_null_space(
 
     weighted = weights[:, None] * null
     hessian, gradient = null.T @ weighted, weighted.T @ ahead
+    # DAQP bounds the rows N a, of which there is one for each joint.
     low, high = (np.ascontiguousarray(bound) for bound in bounds)
     if np.any(low > high):
         return None
@@ -231,6 +239,7 @@ class PlanePath:
     @property
     def duration(self) -> float:
         """Time [s], with constant acceleration."""
+        # From rest to the speed v with constant acceleration, the mean speed is v / 2.
         return 2 * self.length / self.speed
 
     def sampled(self, period: float) -> Iterator[Array]:
@@ -238,6 +247,7 @@ class PlanePath:
         duration, length = self.duration, self.length
         for k in range(1, round(duration / period + 0.499) + 1):
             t = min(k * period, duration)
+            # s(t) = v t^2 / (2 T) from rest, and v (t - t^2 / (2 T)) to rest.
             accelerated = t * t / (2 * duration)
             yield self.at(
                 min(
@@ -277,6 +287,7 @@ class PlanePath:
         cut = min(before, after)
         if turn < MIN_BEND_RAD or cut == 0:
             return 0.0, 0.0, 0.0
+        # An arc that is tangential to both lines at a distance c from the bend.
         return cut, cut / np.tan(turn / 2), turn
 
 
@@ -295,6 +306,7 @@ def striking_path(
     low = np.array([min(start[0], hit[0]), MIN_MALLET_XY_M[1]])
     high = np.array([max(start[0], hit[0]), MAX_MALLET_XY_M[1]])
     path = PlanePath(start, _exit_point(hit, -velocity, low, high), hit, speed)
+    # v = 2 L / T and a = v / T give T >= sqrt(2 L / a).
     duration = max(2 * path.length / speed, np.sqrt(2 * path.length / acceleration))
     return PlanePath(path.start, path.bend, hit, 2 * path.length / duration)
 

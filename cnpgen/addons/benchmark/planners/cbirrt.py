@@ -103,6 +103,7 @@ def joint_space(base: Any, robot: Robot) -> Any:
 
 def timed(path: Array, velocity_limit: Array) -> Trajectory:
     """Time a path, shape (K, n), so that one joint is at its velocity limit [rad/s] in every step."""
+    # The slowest joint determines a step: max_j |dq_j| / V_j.
     steps = (
         np.max(np.abs(np.diff(path, axis=0)) / velocity_limit, axis=1) + STEP_PAUSE_S
     )
@@ -189,6 +190,8 @@ class Search(PathSearch):
         position, rotation, J = self._tip.at(q)
         if self._table is not None:
             return float(position[2] - self._table.z), J[2]
+        # With dR/dt = w x R, the gradient of R_22 has the z components of w_j x (R
+        # e_z).
         return float(rotation[2, 2] - 1.0), np.cross(J[3:].T, rotation[:, 2])[:, 2]
 
     def is_valid(self, q: Array) -> bool:
@@ -201,6 +204,7 @@ class Search(PathSearch):
             return bool(
                 x.low <= position[0] <= x.high and y.low <= position[1] <= y.high
             )
+        # Velocities are ignored, so only torques of gravity count.
         gravity_torque = pin.computeGeneralizedGravity(self._robot.model, self._data, q)
         if np.any(np.abs(gravity_torque) > self._robot.holding_limit):
             return False

@@ -125,6 +125,8 @@ class Drake(BenchmarkPlanner):
             program.AddJerkBounds(-robot.jerk_limit, robot.jerk_limit)
         add_boundary_conditions(program, boundary)
         distance = np.abs(boundary.goal_q[0] - boundary.start_q[0])
+        # A cubic from rest to rest accelerates by at most 6 d / T^2, and is slower than
+        # 2 d / T.
         times = (
             2 * distance / robot.velocity_limit,
             np.sqrt(6 * distance / robot.acceleration_limit),
@@ -168,6 +170,7 @@ def add_boundary_conditions(program: Any, boundary: Boundary) -> None:
             for weight, point in zip(second.tolist(), row, strict=True)
             if weight
         )
+        # With s = t / T, the second derivative by s is ddq T^2.
         condition = curvature - acceleration * duration**2
         program.get_mutable_prog().AddConstraint(condition == 0.0)
 

@@ -131,6 +131,8 @@ class ProposedExtension:
         motion = self.steer(state, target)
         node = 0 if motion is None else self.tree.add(self.node, *motion)
         self.node, self.steps = node, self.steps + 1
+        # After a failure or many steps, the search goes on at a node near a random
+        # position.
         if motion is None or self.steps > MAX_CONSECUTIVE_STEPS:
             position = self.steer.check.random_position(
                 self.steer.obstacle_poses, random
@@ -194,6 +196,7 @@ class Steering:
             controls = self._sample_controls(mean, deviation)
             paths, tips, lengths = self.integrate(state, controls)
             ends = paths[np.arange(self.settings.samples), lengths - 1, : len(target)]
+            # Controls whose first state is invalid have no end.
             distances = np.where(
                 lengths > 0, np.linalg.norm(ends - target, axis=1), np.inf
             )
@@ -207,6 +210,7 @@ class Steering:
             elites = controls[order[np.isfinite(distances[order])]]
             if least < TARGET_TOLERANCE_RAD or not len(elites):
                 break
+            # A small step towards the elites keeps the distribution wide.
             mean = (1 - CEM_LEARNING_RATE) * mean + CEM_LEARNING_RATE * elites.mean(
                 axis=0
             )
@@ -247,7 +251,9 @@ class Steering:
         tips, valid_states = self.check(
             flat[:, :n], flat[:, n:], ddq.reshape(-1, n), self.obstacle_poses
         )
+        # States until the time of each control, rounded to the nearest step.
         active = t[:, 0] < controls[:, n:] + STEERING_STEP_S / 2
+        # Everything after the first invalid state counts as invalid.
         valid = np.logical_and.accumulate(
             valid_states.reshape(active.shape) & active, axis=1
         )

@@ -82,6 +82,7 @@ class FreeSearch(PathSearch):
         """Return OMPL's information about the joint positions, and its states at start and goal."""
         space = joint_space(ompl.base, self._robot)
         information = ompl.base.SpaceInformation(space)
+        # OMPL states the resolution as a fraction of the space's extent.
         information.setStateValidityCheckingResolution(
             STATE_DISTANCE_RAD / space.getMaximumExtent()
         )
@@ -126,6 +127,7 @@ class RRTConnect(BenchmarkPlanner):
 
         def plan(task: Plans) -> Answer:
             seed_ompl(ompl, setting, task)
+            # At least half of the time is for the search.
             simplify_time = min(self.simplify_time, setting.time_limit / 2)
             search = search_for(task)
             search_time = setting.time_limit - simplify_time
@@ -164,8 +166,10 @@ def timed_by_toppra(
     toppra = load_toppra()
     steps = np.linalg.norm(np.diff(path, axis=0), axis=1)
     kept = np.append(True, steps > MIN_WAYPOINT_DISTANCE_RAD)
+    # The goal is a waypoint, however close the one before it is.
     kept[-1] = True
     points = path[kept]
+    # The parameter of the spline is the length of the path, scaled to 1.
     length = np.append(0.0, np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1)))
     if not np.all(np.diff(length, prepend=-1.0) > 0):
         # Start and goal coincide.
@@ -184,7 +188,9 @@ def timed_by_toppra(
         limits, spline, parametrizer="ParametrizeConstAccel"
     )
     tangent = spline(1.0, 1)
+    # Speed ds/dt whose velocity p' ds/dt is nearest to that of the goal.
     end_rate = max(float(tangent @ goal_dq / (tangent @ tangent)), 0.0)
+    # The full speed may be infeasible at the end of the path.
     for fraction in END_RATE_FRACTIONS:
         timed = timing.compute_trajectory(0.0, fraction * end_rate)
         if timed is not None:

@@ -102,6 +102,7 @@ class ManifoldSet:
             residual, gradient = self._search.residual(q)
             if abs(residual) <= PROJECTION_TOLERANCE:
                 return q
+            # Newton step of minimum norm: q -= r g / |g|^2.
             q -= (
                 residual
                 * gradient

@@ -96,6 +96,7 @@ class Tree:
 
     def select(self, position: Array) -> int:
         """Return the active node of least cost near a position, or the nearest one."""
+        # Only the cheapest node near each witness is extended.
         active = self._holders.rows.astype(int)
         distances = np.linalg.norm(self._tips.rows[active] - position, axis=1)
         close = active[distances < self._radii.select]
@@ -110,15 +111,18 @@ class Tree:
 
         Return the active node near the witness: the new one or the cheaper one.
         """
+        # The cost is time: a step for each state of the path.
         node, cost = len(self._paths), self._cost.rows[parent] + self._step * len(path)
         distances = np.linalg.norm(self._witnesses.rows - tip, axis=1)
         witness = int(np.argmin(distances))
         if distances[witness] >= self._radii.witness:
+            # A position far from all witnesses becomes one itself.
             self._witnesses.append(tip)
             self._holders.append(node)
         elif self._cost.rows[holder := int(self._holders.rows[witness])] <= cost:
             return holder
         else:
+            # The former node stays in its branch, but is no longer extended.
             self._holders.rows[witness] = node
         self._paths.append(path)
         self._parents.append(parent)
@@ -177,6 +181,7 @@ class _GrowingArray:
     def append(self, row: Array | float) -> None:
         """Add a row."""
         if self._count == len(self._all):
+            # Doubling keeps the cost of all copies linear in the number of rows.
             self._all = np.concatenate([self._all, np.empty_like(self._all)])
         self._all[self._count] = row
         self._count += 1
@@ -264,6 +269,7 @@ class SST(BenchmarkPlanner):
             CONTROL_STEP_S
             * np.arange(1.0, random.integers(1, self.max_steps + 1) + 1)[:, None]
         )
+        # Constant acceleration: q + dq t + ddq t^2 / 2.
         path_q, path_dq = q + t * (dq + t / 2 * ddq), dq + t * ddq
         tips, valid = check(
             path_q, path_dq, np.broadcast_to(ddq, path_q.shape), obstacle_poses

@@ -119,12 +119,14 @@ def _obstacle_violations(state: SymbolicState) -> list[Scalar]:
     for box, top in zip(state.obstacles, state.obstacle_poses, strict=True):
         spans = [(span.low, span.high) for span in (box.x, box.y) if span is not None]
         sides = (*spans, (-np.inf, top))
+        # Distance of the tip from a box: the norm of its excesses along the axes.
         outside = [
             ca.fmax(ca.fmax(low - x, x - high), 0)
             for x, (low, high) in zip(tip, sides, strict=True)
         ]
         violation.append(MIN_OBJECT_DISTANCE_M - ca.sqrt(dot(outside, outside)))
         for corner in corners:
+            # A corner is inside by its least distance from a face, negative outside.
             depths = [
                 ca.fmin(x - low, high - x)
                 for x, (low, high) in zip(corner, sides, strict=True)

@@ -139,6 +139,8 @@ class TrajOptTranscription:
         Its derivatives are those in its parameter.
         """
         b = self._boundary
+        # Cubic sum_i a_i (1 - s)^(3 - i) s^i with q and dq of both ends, as if T were
+        # 1.
         a = np.vstack(
             [b.start_q, b.start_dq + 3 * b.start_q, 3 * b.goal_q - b.goal_dq, b.goal_q]
         )
@@ -151,6 +153,8 @@ class TrajOptTranscription:
             for order in range(3)
         )
         robot = self._robot
+        # A duration T divides dq by T and ddq by T^2: the least T that meets both
+        # limits.
         time = (
             np.max(np.abs(dq) / robot.velocity_limit),
             np.sqrt(np.max(np.abs(ddq) / robot.acceleration_limit)),
@@ -181,6 +185,7 @@ class TrajOptTranscription:
     def defects(self, x: Array) -> Array:
         """Return the defects of explicit Euler steps between knots, shape (2 (KNOTS - 1) n,)."""
         q, dq, ddq, duration = self.unpack(x)
+        # Steps are T / 15 over 14 intervals, as in the authors' version.
         step = duration / KNOTS
         return np.concatenate(
             [
@@ -201,6 +206,7 @@ class TrajOptTranscription:
         J = np.zeros((2 * rows, self._size))
         first, second = slice(0, inner * n), slice(inner * n, 2 * inner * n)
         J[:rows, first] = np.kron(differences, unit)
+        # Defects q_k+1 - q_k - h dq_k have the derivatives +1, -1 and -h.
         J[:rows, second] = -step * np.kron(selection[:, 1:-1], unit)
         J[rows:, second] = np.kron(differences, unit)
         J[rows:, second.stop : -1] = -step * np.kron(selection[:, self._free_ddq], unit)
@@ -219,6 +225,8 @@ class TrajOptTranscription:
         g, derivatives = self._at_knots(q[1:-1], dq[1:-1], ddq[1:-1])
         rows = g.shape[1]
         J = np.zeros((inner, rows, self._size))
+        # If accelerations at both ends are free, too, those of inner knots follow the
+        # first one.
         offset = 1 - self._free_ddq.start
         starts = 0, inner * n, 2 * inner * n + offset * n
         for derivative, start in zip(derivatives, starts, strict=True):
@@ -243,6 +251,7 @@ def _on_table(table: Table, robot: Robot) -> KnotConstraints:
 
     |y| and |z| are two inequalities each.
     """
+    # Rows are x, y, -y, z and -z of the tip.
     signs = np.array([[1, 0, 0], [0, 1, 0], [0, -1, 0], [0, 0, 1], [0, 0, -1]], float)
     bound = np.array(
         [
@@ -283,6 +292,8 @@ def _with_object(robot: Robot, size: Array, boxes: list[Box]) -> KnotConstraints
     def object_values(q: Array) -> tuple[list[float], Array]:
         position, rotation, J = tip.at(q)
         turning = J[3:]
+        # With dR/dt = w x R, the gradient of R_22 has the z components of w_j x (R
+        # e_z).
         values, gradients = (
             [rotation[2, 2] - 1.0],
             [np.cross(turning.T, rotation[:, 2])[:, 2]],
@@ -294,12 +305,14 @@ def _with_object(robot: Robot, size: Array, boxes: list[Box]) -> KnotConstraints
             for corner in (CUBE * size) @ rotation.T:
                 penetration, normal = depth(position + corner, box)
                 values.append(-penetration)
+                # A corner at r from the tip moves with v + w x r.
                 gradients.append(-normal @ (J[:3] + np.cross(turning.T, corner).T))
         return values, np.array(gradients)
 
     def knot(q: Array, dq: Array, ddq: Array) -> tuple[Array, Array, Array, Array]:
         values, gradient = object_values(q)
         pin.computeRNEADerivatives(model, data, q, dq, ddq)
+        # Pinocchio fills the upper half of the symmetric M only.
         inertia, torque = np.triu(data.M) + np.triu(data.M, 1).T, np.array(data.tau)
         g = np.concatenate([values, limit - torque, limit + torque])
         rows = [

@@ -114,6 +114,7 @@ def execute_in_challenge(
         while not done:
             done = environment.advance(_action(scene, reference, tick))
             tick += TICKS_PER_STEP
+            # Violations count up to the end of the plan, not while the puck moves on.
             if tick < reference.ticks + TICKS_PER_STEP:
                 environment.count_violations()
             done = tick >= reference.ticks and (
@@ -161,6 +162,7 @@ def _tick_record(
     tip, rotation, _ = (
         np.array(part) for part in zip(*map(evaluated.at, q), strict=True)
     )
+    # The record begins with the state at tick 0.
     desired = reference.at(np.arange(len(q)))[0]
     torque_use = torque[:, planned] / rated_torque(scene.problem, robot)
     unknown_force = np.full((len(q), 2), np.nan)

@@ -62,6 +62,7 @@ class Controller:
         """Compute the torque that takes effect now [N m], shape (n,), from the measured and the desired state."""
         import pinocchio as pin
 
+        # Poles of the error are both at -w: critical damping.
         acceleration = (
             desired[2]
             + GAIN_RAD_S**2 * (desired[0] - q)
@@ -79,6 +80,8 @@ class Controller:
             - holding_torque
         )
         with np.errstate(divide="ignore", invalid="ignore"):
+            # The largest k with |holding torque + k change| within the limit, over all
+            # joints. Joints without a change give inf or nan.
             scale = np.nanmin(
                 (self.limit - np.sign(acceleration_torque) * holding_torque)
                 / np.abs(acceleration_torque)
@@ -219,6 +222,7 @@ class _Run:
         state = data.qpos.copy(), tip, rotation, desired[0], torque, data.qvel.copy()
         data.qfrc_applied[:n] = torque
         self._mujoco.mj_step(self._model, data, round(TICK_S / SIMULATION_STEP_S))
+        # With a puck, all listed contacts are legal.
         if self._scene.puck is None and data.ncon:
             self._max_penetration = max(
                 self._max_penetration, float(-data.contact.dist.min())

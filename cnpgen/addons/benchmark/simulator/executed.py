@@ -186,6 +186,7 @@ def puck_is_done(reference: Reference, tick: int, x: float, speed: float) -> boo
 
     x is its position along the table [m].
     """
+    # A puck at rest before the end of plan and stop may still be hit.
     stopped = tick > len(reference.q) and speed < MIN_PUCK_SPEED_M_S
     outside = x > hockey.GOAL_LINE_M + hockey.PUCK_RADIUS_M
     return (
@@ -260,7 +261,9 @@ def _with_puck(executed: Executed, record: TickRecord, planned_tip: Array) -> Ex
     if not len(touched):
         return replace(executed, hit=False, scored=False, touched_early=False)
     first = int(touched[0])
+    # Length of the planned path from the first contact to its end.
     left = float(np.linalg.norm(np.diff(planned_tip[first:], axis=0), axis=1).sum())
+    # Drag slows the puck later: its speed is the largest one soon after the contact.
     speeds_after = speed[first : first + round(10 * hockey.CONTACT_TIME_S / TICK_S)]
     x, y = record.puck.T
     return replace(

@@ -68,6 +68,7 @@ def make_reference(
         )
     during = states(np.arange(0.0, duration, TICK_S))
     q, dq, _ = (values[0] for values in states(np.array([duration])))
+    # One time for all joints: the one that needs longest at its limit determines it.
     stop = max(float(np.max(np.abs(dq) / acceleration_limit)), TICK_S)
     if not stop <= MAX_EXECUTED_DURATION_S:
         raise UsageError(
@@ -77,6 +78,7 @@ def make_reference(
     first = len(during[0]) * TICK_S - duration
     after = np.minimum(np.append(np.arange(first, stop, TICK_S), stop), stop)[:, None]
     left = 1 - after / stop
+    # With a velocity that falls linearly, the way is the mean velocity times the time.
     parts = (
         q + dq * after * (1 + left) / 2,
         dq * left,

@@ -170,6 +170,7 @@ def _arm(scene: SimulatorScene) -> Iterator[str]:
     yield f'<geom name="mallet" type="sphere" size="{MALLET_POINT_RADIUS_M}"/>'
     if scene.problem.object_size is not None:
         size = _numbers(
+            # MuJoCo's boxes have half edges.
             np.array(scene.problem.object_size) / 2 - _legal_depth(scene.problem)
         )
         yield f'<geom name="object" type="box" size="{size}" rgba="0.2 0.4 0.8 1"/>'
@@ -235,6 +236,7 @@ def _environment(scene: SimulatorScene) -> Iterator[str]:
 def _shape(name: str, obstacle: Obstacle, solid: Solid) -> str:
     """Return shape and pose of an obstacle as MJCF attributes."""
     if isinstance(solid, Box):
+        # Obstacles without a lower end are cut far below.
         low = (
             solid.low
             if obstacle.height is not None
@@ -282,6 +284,8 @@ def _puck(surface: float, height: float) -> Iterator[str]:
     yield f'<geom name="puck" type="sphere" size="{hockey.PUCK_RADIUS_M}" rgba="0 0 0 0"/>'
     yield f'<geom type="cylinder" size="{hockey.PUCK_RADIUS_M} {hockey.PUCK_HEIGHT_M / 2}" rgba="0.85 0.1 0.1 1"'
     yield f' pos="0 0 {hockey.PUCK_HEIGHT_M / 2}"/>'
+    # The mallet collides as a small sphere, so the disc has the sum of both radii less
+    # the sphere's.
     radius = hockey.PUCK_RADIUS_M + hockey.MALLET_RADIUS_M - MALLET_POINT_RADIUS_M
     yield f'<geom name="reach" type="cylinder" size="{radius} {(high - low) / 2}" rgba="0 0 0 0"'
     yield f' pos="0 0 {(low + high) / 2 - surface}"/></body>'
@@ -293,6 +297,7 @@ def _pairs(scene: SimulatorScene) -> Iterator[str]:
         yield f'<pair geom1="mallet" geom2="support" {_TABLE}/>'
     if scene.puck is not None:
         k, b = hockey.bounce()
+        # Negative numbers of solref are stiffness and damping themselves.
         bouncing = f'condim="1" solref="{-k} {-b}" solimp="0.9999 0.9999 0.001"'
         yield f'<pair geom1="mallet" geom2="reach" {bouncing}/>'
         for name in _RIMS:
@@ -314,6 +319,7 @@ def quaternion(rotation: Array) -> str:
     """Write a rotation matrix as MuJoCo's quaternion, scalar first."""
     from scipy.spatial.transform import Rotation
 
+    # SciPy has the scalar last.
     return _numbers(np.roll(Rotation.from_matrix(rotation).as_quat(), 1))
 
 

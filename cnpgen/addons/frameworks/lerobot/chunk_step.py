@@ -197,6 +197,8 @@ class ChunkStep(ProcessorStep):  # type: ignore[misc] # LeRobot has no types
             )
         chunk[:, :n] = self._radians(chunk[:, :n])
         now = self._clock()
+        # The difference at the observation is added to the present set point: no later
+        # state is measured.
         measured = self._advance(now).q + seen.error, seen.dq
         self.last_join = self._executor.step(now, chunk, seen.time, measured)
         # Earlier states of a stale chunk are forgotten, and its commands dropped.
@@ -204,6 +206,7 @@ class ChunkStep(ProcessorStep):  # type: ignore[misc] # LeRobot has no types
         for row, at in zip(chunk, times.tolist(), strict=True):
             point = self._executor.state_at(at)
             others = point.others if point.others.size else seen.others
+            # Inverse of the conversion to radians.
             row[:n] = (point.q - self._zero) / self._factor
             row[n:] = others[: len(row) - n]
         return action.new_tensor(chunk[None])
@@ -245,6 +248,7 @@ def _time_to_rest(
     ]
     if min(values) <= 0:
         return None
+    # Two samples less: the join is at the next sample, and K samples have K - 1 spans.
     left = (values[1] - 2) / values[0] - values[2] - values[3]
     least = MAX_DURATION * (MIN_CHUNK_SAMPLES - 1) / values[0]
     if left < least:

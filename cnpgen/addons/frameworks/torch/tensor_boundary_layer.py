@@ -35,6 +35,8 @@ class TensorBoundaryLayer:
         )
         self._steps = effective_steps(kernels, layer.projection_steps)
         self._equalities = TensorTape(kernels.tape(equality_residuals))
+        # Control points at an end follow from position, velocity and, if given,
+        # acceleration.
         fixed = 3 if layer.goal_acceleration == "given" else 2
         points = problem.trajectory.path_control_points
         self._interior = slice(3, points - fixed)
@@ -91,6 +93,7 @@ class TensorBoundaryLayer:
             len(phi), -1, first.shape[2]
         )
         along = torch.tensor(along_line(interior.shape[1]), **kind)
+        # Offsets phi are added to the line between the fixed points of both ends.
         interior = interior + first[:, 2:3] + (last[:, :1] - first[:, 2:3]) * along
         if tasks.correction is not None:
             interior = interior + torch.tensor(tasks.correction, **kind)
@@ -104,6 +107,7 @@ class TensorBoundaryLayer:
             torch.tensor(self._table, **kind),
             torch.tensor(self._response, **kind),
         )
+        # Response of the path at one collocation phase to a change at another one.
         coupling = table[:, self._interior] @ response
         for _ in range(self._steps):
             q = torch.einsum("kc,ncj->jnk", table, path)
@@ -116,6 +120,7 @@ class TensorBoundaryLayer:
                 .flatten(3)
                 .flatten(1, 2)
             )
+            # Damped normal equations stay regular at singular Jacobians.
             normal = normal + PROJECTION_DAMPING * torch.eye(normal.shape[1], **kind)
             force = torch.linalg.solve(normal, residual.permute(1, 2, 0).flatten(1))
             force = force.reshape(len(path), -1, residual.shape[0])  # (N, K, m)
@@ -123,6 +128,7 @@ class TensorBoundaryLayer:
             before, inner, after = path.tensor_split(
                 (self._interior.start, self._interior.stop), dim=1
             )
+            # Large steps leave the region in which the linearization holds.
             path = torch.cat(
                 [before, inner + step.clamp(-MAX_STEP_RAD, MAX_STEP_RAD), after], dim=1
             )

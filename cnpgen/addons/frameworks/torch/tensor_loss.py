@@ -149,11 +149,13 @@ class TensorLoss:
             & path.isfinite().flatten(1).all(1)
             & rate.isfinite().all(1)
         )
+        # Ones keep operations and gradients finite; their results are dropped.
         path, rate = (
             torch.where(valid[:, None, None], path, 1.0),
             torch.where(valid[:, None], rate, 1.0),
         )
         terms = self._integrate(*_FiniteGradient.apply(path, rate), *arguments)
+        # Nan marks the loss of an invalid plan.
         terms = torch.where(valid[:, None], terms, torch.nan)
         return terms[:, 0] + terms[:, 1:] @ arguments[-1], terms
 
@@ -170,6 +172,8 @@ class TensorLoss:
         p = torch.einsum("okc,ncj->ojkn", path_basis, path)
         r = torch.einsum("okc,nc->okn", rate_basis, rate)
         fixed = (tightening[:, None, None], weights[:, None, None])
+        # The tape has quadrature weights as input, so its results are the summands of
+        # integrals.
         (summands,) = self._tape(
             *p.unbind(0), r, poses.T[:, None], relaxation, nodes[None, :, None], *fixed
         )
@@ -179,6 +183,7 @@ class TensorLoss:
         """Return the basis functions of path and rate, shape (orders, K, C), and the quadrature weights, shape (K,)."""
         key = (shift, *kind.values())
         if key not in self._tables:
+            # The oldest table makes room: dictionaries keep the order of insertion.
             if len(self._tables) == MAX_KEPT_TABLES:
                 self._tables.pop(next(iter(self._tables)))
             table = self._basis(shift)

@@ -27,6 +27,7 @@ def spline_derivatives(
     """
     points, s = control.shape[1], s.expand(len(control), s.shape[-1])
     spans = points - degree
+    # The span itself is constant: derivatives by s are those of its polynomial.
     span = (s.detach() * spans).long().clamp(0, spans - 1)
     table = _taylor_table(points, degree, control.dtype, control.device)
     coefficients = torch.einsum("nkdc,nc...->dnk...", table[span], control)
@@ -38,6 +39,8 @@ def spline_derivatives(
     results = []
     for order in range(orders):
         value = torch.zeros_like(coefficients[0])
+        # Horner's scheme: the derivative of c x^k has the factor k (k - 1) ... of
+        # perm(k, order).
         for power in range(degree, order - 1, -1):
             value = value * offset + math.perm(power, order) * coefficients[power]
         results.append(value)
@@ -60,6 +63,7 @@ def joint_states(
     """
     p, p1, p2 = spline_derivatives(path, s, spec.degree)
     r, r1 = (x[..., None] for x in spline_derivatives(rate, s, spec.degree, 2))
+    # Chain rule: dq = p' r and ddq = p'' r^2 + p' r r', with r = ds/dt.
     return p, p1 * r, p2 * r**2 + p1 * r * r1
 
 
@@ -89,8 +93,10 @@ def start_points(
         end_derivatives(n, spec.degree)
         for n in (spec.path_control_points, spec.rate_control_points)
     )
+    # r and r' at the start.
     first_rate, change = rate[:, :1], speed.eta * (rate[:, 1:2] - rate[:, :1])
     first = dq / first_rate
+    # From ddq = p'' r^2 + p' r r', solved for p''.
     second = (ddq - first * change * first_rate) / first_rate**2
     c1 = q + first / path.eta
     return torch.stack([q, c1, second / path.beta - 2 * q + 3 * c1], dim=1)

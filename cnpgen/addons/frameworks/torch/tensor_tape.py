@@ -106,7 +106,10 @@ class TensorTape:
                 self._rows[selected.index(int(tape.b[k]))][int(tape.constant[k])] = (
                     operands[k][0]
                 )
+                # Results live to the end, beyond all operations.
                 last[operands[k][0]] = len(tape)
+            # Backward, the first use that is met is the last one. Unused operations
+            # never enter.
             elif k in last:
                 for operand in operands[k]:
                     last.setdefault(operand, k)
@@ -116,6 +119,7 @@ class TensorTape:
             elif names[k] == "INPUT":
                 self._inputs.append((k, int(tape.a[k]), int(tape.b[k])))
             else:
+                # Values without a later use free their memory at once.
                 dead = tuple(
                     operand for operand in set(operands[k]) if last[operand] == k
                 )

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from cnpgen.cli.describe import (
+from cnpgen.addons.manual.describe import (
     describe,
     describe_pipeline,
     numbers,

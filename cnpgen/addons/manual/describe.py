@@ -6,6 +6,7 @@ from textwrap import wrap
 from typing import Any
 
 from cnpgen.cli.terminal import LINE_WIDTH, table
+from cnpgen.make.any_recipe import Recipe
 from cnpgen.make.recipe import DatasetRecipe, recipe_digest
 from cnpgen.pipelines.pipeline import Pipeline
 from cnpgen.pipelines.stages.stage import Stage
@@ -25,8 +26,6 @@ from cnpgen.robots.urdf_parameters import urdf_parameters
 from cnpgen.schema import registry
 from cnpgen.schema.keys import PerJoint, Range, keys
 from cnpgen.store.joint_units import unit_of
-
-Recipe = Problem | Pipeline | DatasetRecipe
 
 LIMITS = {  # with their units at joints that turn
     "position_lower": "rad",

@@ -6,7 +6,7 @@ import re
 
 import pytest
 
-from cnpgen.cli.describe_keys import (
+from cnpgen.addons.manual.describe_keys import (
     describe_kind,
     keys_to_dict,
     kind_summary,

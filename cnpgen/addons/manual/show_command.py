@@ -6,22 +6,11 @@ code is 2.
 """
 
 import argparse
-from typing import TYPE_CHECKING
 
 from cnpgen.cli.parser import Parser, add_json
 from cnpgen.cli.recipe_names import check_recipe
 from cnpgen.errors import UsageError
-from cnpgen.schema.toml import MARKS, Kind, kind_of_file
-
-if TYPE_CHECKING:
-    from cnpgen.cli.describe import Recipe
-
-# A dataset includes the other two.
-KINDS: tuple[Kind, ...] = (
-    "dataset",
-    "pipeline",
-    "problem",
-)
+from cnpgen.schema.toml import MARKS
 
 
 def add_options(parser: Parser) -> None:
@@ -49,14 +38,15 @@ def add_options(parser: Parser) -> None:
     )
     parser.add_argument(
         "--kind",
-        choices=KINDS,
+        choices=("dataset", "pipeline", "problem"),
         help="kind of the recipe, if several have the same name",
     )
     add_json(parser)
 
 
 def run(arguments: argparse.Namespace) -> None:
-    from cnpgen.cli import describe
+    from cnpgen.addons.manual import describe
+    from cnpgen.make.any_recipe import load_any
     from cnpgen.store.files.documents import plain, render
 
     if arguments.recipe is None:
@@ -75,7 +65,7 @@ def run(arguments: argparse.Namespace) -> None:
 
 def _about_kinds(arguments: argparse.Namespace) -> str:
     """Describe a kind of stage or constraint, or the keys of recipe files."""
-    from cnpgen.cli import describe_keys
+    from cnpgen.addons.manual import describe_keys
     from cnpgen.schema import registry
     from cnpgen.store.files.documents import plain, render
 
@@ -100,23 +90,3 @@ def _page_of_keys(kind: str) -> str:
         return page
     head = f"\n## {kind.capitalize()} files\n"
     return (head + page.partition(head)[2].partition("\n## ")[0]).strip()
-
-
-def load_any(name_or_path: str, kind: Kind | None = None) -> "Recipe":
-    """Load a recipe of any kind.
-
-    Of several with the same name the one that includes the others.
-    """
-    from cnpgen.make.recipe import load_dataset_recipe
-    from cnpgen.pipelines.pipeline import load_pipeline
-    from cnpgen.problems.problem_file import load_problem
-    from cnpgen.schema.catalogue import find_recipe
-
-    kind = kind or kind_of_file(find_recipe(KINDS, name_or_path))
-    if kind == "dataset":
-        return load_dataset_recipe(name_or_path)
-    return (
-        load_pipeline(name_or_path)
-        if kind == "pipeline"
-        else load_problem(name_or_path)
-    )

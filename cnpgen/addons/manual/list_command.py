@@ -150,7 +150,7 @@ def _suite(_: str, file: Path) -> dict[str, Any]:
 
 def _summary(group: str, name: str) -> str:
     """Return one line about a kind; a broken plug-in must not hide the others."""
-    from cnpgen.cli.describe_keys import kind_summary
+    from cnpgen.addons.manual.describe_keys import kind_summary
     from cnpgen.schema import registry
 
     try:

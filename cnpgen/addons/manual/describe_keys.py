@@ -4,7 +4,7 @@ import dataclasses
 from collections.abc import Sequence
 from typing import Any, get_args
 
-from cnpgen.cli.describe import quantity, title_lines
+from cnpgen.addons.manual.describe import quantity, title_lines
 from cnpgen.cli.terminal import table
 from cnpgen.make.recipe import DatasetRecipe
 from cnpgen.pipelines.pipeline import Pipeline
