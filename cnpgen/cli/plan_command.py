@@ -14,7 +14,6 @@ repeated command.
 
 import argparse
 import sys
-import warnings
 from hashlib import sha256
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -247,11 +246,9 @@ def _draws(arguments: argparse.Namespace, model: "Model") -> "Requests":
     from cnpgen.make.recipe import load_dataset_recipe
     from cnpgen.planner.plan_requests import (
         Requests,
-        are_training_stages,
         check_stages,
         checked_boundary,
         context_columns,
-        training_rows_of,
     )
     from cnpgen.problems.problem import resolved
     from cnpgen.problems.problem_record import record_problem
@@ -266,20 +263,13 @@ def _draws(arguments: argparse.Namespace, model: "Model") -> "Requests":
         )
     recipe = load_dataset_recipe(name)
     stages = plain(resolved(recipe.pipeline))["stage"]
-    # The shipped model of the recipe's name.
-    is_own = arguments.model == name
     check_stages(
         name,
         record_problem(recipe.pipeline.problem),
         stages,
         model,
-        other=arguments.other_rows or is_own,
+        other=arguments.other_rows,
     )
-    if is_own and not are_training_stages(stages, model):
-        text = f"the model {name!r} was trained on rows of {training_rows_of(model)!r}, drawn in another way"
-        warnings.warn(
-            f"{text}: more of its plans may be invalid", UserWarning, stacklevel=2
-        )
     problems = draw_boundary_problems(recipe, arguments.n, seed=arguments.seed)
     boundary = checked_boundary(name, problems.boundary.arrays(), model)
     return Requests(boundary, problems.sample_id, context_columns(problems.columns))

@@ -260,25 +260,15 @@ def check_stages(
 ) -> None:
     """Raise an error for rows of another problem, and unless ``other`` for rows drawn by other resolved stages."""
     check_problem(where, record, model)
-    name = training_rows_of(model)
-    if other or are_training_stages(drawn_by, model):
+    stages = model.training.get("stages")
+    if other or stages is None or _stages_sha256(stages) == _stages_sha256(drawn_by):
         return
+    name = model.training.get("dataset", {}).get("name", "another dataset")
     raise DatasetError(
         f"the rows of {where} are drawn in another way than those of {name!r} that the model was trained on: the"
         " recipe has changed since, or is another one; pass {other} to plan for them",
         remedies={"other": True},
     )
-
-
-def training_rows_of(model: Model) -> str:
-    """Return the name of the dataset that a model was trained on."""
-    return str(model.training.get("dataset", {}).get("name", "another dataset"))
-
-
-def are_training_stages(drawn_by: Iterable[Mapping[str, Any]], model: Model) -> bool:
-    """Return whether resolved stages draw the rows that a model was trained on, or the model does not name them."""
-    stages = model.training.get("stages")
-    return stages is None or _stages_sha256(stages) == _stages_sha256(drawn_by)
 
 
 def _stages_sha256(stages: Iterable[Mapping[str, Any]]) -> str:

@@ -8,12 +8,14 @@ import pytest
 from cnpgen.errors import UsageError
 from cnpgen.make.recipe import load_dataset_recipe
 from cnpgen.planner.model_file import load_model, model_for, shipped_models
-from cnpgen.planner.plan_requests import read_rows
+from cnpgen.planner.plan_requests import check_stages, read_rows
 from cnpgen.planner.planner import Planner
 from cnpgen.plans.evaluate import evaluate_plans
+from cnpgen.problems.problem import resolved
 from cnpgen.problems.problem_file import load_problem
 from cnpgen.problems.problem_record import record_problem
 from cnpgen.scenes import make_scenes, plan_scenes
+from cnpgen.store.files.documents import plain
 from tests.conftest import needs_compiler, some
 from tests.examples.example_robots import SHIPPED, needs_robots, with_robots
 
@@ -56,10 +58,13 @@ def test_there_is_a_shipped_model_for_every_dataset_of_random_draws():
 
 
 @pytest.mark.parametrize("name", with_robots(STRICT))
-def test_a_model_is_small_and_of_the_shipped_problem(name):
+def test_a_model_is_small_and_of_the_recipe_of_its_name(name):
     assert shipped_models()[name].stat().st_size < MAX_MODEL_BYTES
-    model, problem = load_model(name), load_dataset_recipe(name).pipeline.problem
-    assert list(model.problem.differences(record_problem(problem))) == []
+    model, pipeline = load_model(name), load_dataset_recipe(name).pipeline
+    record = record_problem(pipeline.problem)
+    assert list(model.problem.differences(record)) == []
+    stages = plain(resolved(pipeline))["stage"]
+    check_stages(name, record, stages, model, other=False)  # refuses other recipes
 
 
 # Those of the shipped robots: tests/problems/test_shipped_robots.py.
