@@ -15,7 +15,8 @@ from pathlib import Path
 
 BLOCK = re.compile(r"((?:<!-- [^\n]* -->\n)*)```(\w*)\n(.*?)```", re.S)
 LEFT_OUT = "..."
-NUMBER = re.compile(r"[-+]?\d[\d.,]*(?:e[-+]?\d+)?")
+# A dash stands for a number that a row of a table lacks.
+NUMBER = re.compile(r"[-+]?\d[\d.,]*(?:e[-+]?\d+)?|(?<= )-(?= )")
 
 
 def masked(line: str) -> str:
