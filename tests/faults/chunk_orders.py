@@ -1,7 +1,6 @@
 """Random orders of chunks, set points and stops of an executor in threads: after a stop, the motion never changes."""
 
 import sys
-import threading
 import time
 from collections.abc import Callable
 from dataclasses import replace
@@ -14,7 +13,13 @@ from cnpgen.addons.online.switches import ChunkJoin
 from cnpgen.errors import UsageError
 from cnpgen.problems.problem_file import load_problem
 from cnpgen.problems.problem_record import open_problem, record_problem
-from tests.faults.stop_orders import MAX_DELAY_S, MAX_WAIT_S, TICK_S, check_states
+from tests.faults.stop_orders import (
+    MAX_DELAY_S,
+    MAX_WAIT_S,
+    TICK_S,
+    call_in_threads,
+    check_states,
+)
 from tests.faults.stop_orders import StopOutcome as Outcome
 
 Array = NDArray[np.float64]
@@ -56,17 +61,7 @@ class ChunkOrders:
         self._serve(1)
         assert self._step(0.0).accepted, "the first chunk is refused"
         self._serve(int(self._random.integers(3, 40)))
-        requests = self._chosen_requests()
-        delays = self._random.uniform(0.0, MAX_DELAY_S, len(requests))
-        threads = [
-            threading.Thread(target=self._call, args=(*request, delay))
-            for request, delay in zip(requests, delays, strict=True)
-        ]
-        for thread in threads:
-            thread.start()
-        for thread in threads:
-            thread.join(MAX_WAIT_S)
-            assert not thread.is_alive(), "a request hangs"
+        call_in_threads(self._call, self._chosen_requests(), self._random)
         assert not self._errors, self._errors[0]
         self._check()
 

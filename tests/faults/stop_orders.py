@@ -8,7 +8,7 @@ import sys
 import threading
 import time
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -43,6 +43,24 @@ REFUSED = (  # what a request of a random order may be told
     "was not stopped",
     "the stop ends at",
 )
+
+
+def call_in_threads(
+    call: Callable[[str, Callable[[], object], float], None],
+    requests: Sequence[tuple[str, Callable[[], object]]],
+    random: np.random.Generator,
+) -> None:
+    """Call each request, a kind and a function, in a thread of its own after a random delay [s]; wait for all."""
+    delays = random.uniform(0.0, MAX_DELAY_S, len(requests))
+    threads = [
+        threading.Thread(target=call, args=(*request, delay))
+        for request, delay in zip(requests, delays, strict=True)
+    ]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join(MAX_WAIT_S)
+        assert not thread.is_alive(), "a request hangs"
 
 
 @dataclass
@@ -137,17 +155,7 @@ class _Order:
     def run(self) -> None:
         """Start all requests, stop, and check that nothing changes after that."""
         assert self._runtime.switch(self._there, 0.0).accepted
-        requests = self._chosen_requests()
-        delays = self._random.uniform(0.0, MAX_DELAY_S, len(requests))
-        threads = [
-            threading.Thread(target=self._call, args=(*request, delay))
-            for request, delay in zip(requests, delays, strict=True)
-        ]
-        for thread in threads:
-            thread.start()
-        for thread in threads:
-            thread.join(MAX_WAIT_S)
-            assert not thread.is_alive(), "a request hangs"
+        call_in_threads(self._call, self._chosen_requests(), self._random)
         assert not self._errors, self._errors[0]
         self._check(self._runtime.stop(self._runtime.end_time + 1.0))
 

@@ -164,8 +164,8 @@ class LinkOrientation(_LinkPoseConstraint):
         """
         import casadi as ca
 
-        # D = Rx Ry Rz has D_12 = -cos b sin a, D_22 = cos b cos a, and D_01 and D_00
-        # likewise for c.
+        # D = Rx(a) Ry(b) Rz(c) has D_12 = -cos b sin a, D_22 = cos b cos a,
+        # D_01 = -cos b sin c and D_00 = cos b cos c.
         pairs = {0: (-D[1][2], D[2][2]), 2: (-D[0][1], D[0][0])}
         rows = list[Any]()
         for axis in self.bounded:

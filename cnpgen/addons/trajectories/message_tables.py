@@ -85,7 +85,7 @@ def tables_of_document(
         UsageError: The document is none of them, or has an element that is not used
             and not in ``allow_unused``.
     """
-    # Every read of the document is counted, so elements that nobody read are found.
+    # Every read of the document is counted, so elements that were not read are found.
     account = Account(place, UNUSED_ELEMENTS, allow_unused=allow_unused)
     root = accounted({"": document}, account)
     tables = list(_tables(root[""], place))
