@@ -42,7 +42,7 @@ MAX_DELAY_S = 0.01  # of the start of a request, and of planning
 LARGE_EVERY = 20  # every such order is of a shipped model, whose plans are judged
 # The others follow short motions of an arm in joint space: threads meet as often there,
 # and an order takes a tenth of the time.
-SMALL_PROBLEM, N_LIMITS = "airhockey", 4  # limits of position, velocity, acceleration, torque
+SMALL_PROBLEM, N_LIMITS = "airhockey", 3  # limits of position, velocity, acceleration
 SMALL_DURATION_S, SMALL_STEP_RAD, SMALL_GRID_S = 0.3, 0.05, 4e-3
 SMALL_DELAY_S = 2e-3
 MAX_WAIT_S = 120.0  # for a thread; a longer one hangs
