@@ -37,7 +37,8 @@ def is_finished(out: Path, request: object, *, force: bool) -> bool:
     """
     if request_file(out).is_dir():
         raise UsageError(
-            f"{request_file(out)} is a folder: the request of {out.name} is stored there"
+            f"{request_file(out)} is a folder, where the request of {out.name} is"
+            " to be stored: remove it"
         )
     if force or not _is_there(out):
         return False
