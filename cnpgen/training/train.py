@@ -250,5 +250,6 @@ def check_beside(out: Path) -> None:
 
 def remove_temporary_files(out: Path) -> None:
     """Remove the temporary files of killed runs."""
-    for path in (out, *(out.with_suffix(suffix) for suffix in (CHECKPOINT, LOG))):
+    beside = (out.with_suffix(suffix) for suffix in (CHECKPOINT, LOG, PICTURE))
+    for path in (out, *beside):
         remove_leftovers_of(path)

@@ -311,19 +311,12 @@ def _killed(
             -signal.SIGTERM,
             -signal.SIGINT,
         }, f"it ended with {code}"
-        if (folder / "plans.h5").exists() or _is_trained(
-            folder
-        ):  # the same command would refuse to replace them
+        if (folder / "plans.h5").exists():  # complete, but perhaps not its request
             break
     else:
         _finish(kind.words(folder, 2), kind.codes)
     assert kind.product(folder) == expected, "another result"
     return n_signals, f"ended with {code}", shortest
-
-
-def _is_trained(folder: Path) -> bool:
-    """Return whether a training is complete; a run that still has its checkpoint finishes when it is resumed."""
-    return (folder / "model.h5").exists() and not (folder / "model.checkpoint").exists()
 
 
 def _hit(process: subprocess.Popen[bytes], chosen: random.Random) -> bool:

@@ -85,9 +85,10 @@ class PathLimits:
         speed, brake, travel = (table[shapes] for table in shape_table())
         # Place on the path that each law has reached at its phases.
         sigma = start[:, None] + duration[:, None] * travel
-        position = (sigma - self.times[0]) / (self.times[1] - self.times[0])
-        node = np.clip(position.astype(int), 0, len(self.times) - 2)
-        share = np.clip(position - node, 0.0, 1.0)[..., None]
+        node = np.searchsorted(self.times, sigma, side="right") - 1
+        node = np.clip(node, 0, len(self.times) - 2)
+        width = self.times[node + 1] - self.times[node]
+        share = np.clip((sigma - self.times[node]) / width, 0.0, 1.0)[..., None]
         # The tables have w times the duration.
         u2, w = (speed**2)[..., None], (brake / duration[:, None])[..., None]
         # The value is linear in each of the tables, so the two nodes are compared.
@@ -146,6 +147,8 @@ def path_limits(
     assert motion.plan is not None
     # At least three nodes, also for a short remainder of the motion.
     times = np.linspace(first, last, max(3, int((last - first) / NODE_STEP_S) + 2))
+    kinks = _kinks(motion)
+    times = np.union1d(times, kinks[(first < kinks) & (kinks < last)])
     # At its end a sampled motion is at rest: the state before is that of its last cell.
     states = motion.at(np.minimum(times, np.nextafter(motion.end_time, -np.inf)))
     terms = []
@@ -160,6 +163,12 @@ def path_limits(
         MAX_BRAKING_USE * limit, np.abs(rest + square) * (1 + TIMING_ROUNDING)
     )
     return PathLimits(times, rest, square, brake_factor, limit)
+
+
+def _kinks(motion: SampledMotion) -> Array:
+    """Return the edges between cells of unequal widths [s]: only there may an acceleration have a kink."""
+    change = np.abs(np.diff(np.diff(motion.edges)))
+    return motion.edges[1:-1][change > TIMING_ROUNDING]
 
 
 def _terms(
