@@ -335,12 +335,8 @@ def _draw_over_table(
     above, beside = figure.subplots(2, 1, height_ratios=[1.5, 1.0])
     x, y, z = world.parameters.on_table(world.tip_position)
     low, high = table.bounds_of(world.parameters.values)
-    width, height = high[0] - low[0], high[1] - low[1]
-    above.add_patch(
-        Rectangle(
-            (low[0], low[1]), width, height, fill=False, edgecolor=_LIMIT, zorder=0
-        )
-    )
+    sizes = high[0] - low[0], high[1] - low[1]
+    above.add_patch(Rectangle(low, *sizes, fill=False, edgecolor=_LIMIT, zorder=0))
     _draw_tip_path(above, x, y)
     above.set_aspect("equal")
     above.margins(0.08)
@@ -359,7 +355,10 @@ def _draw_over_table(
     beside.fill_between(
         t, -band, band, color="tab:green", alpha=0.12, linewidth=0, label="valid"
     )
-    beside.plot(t, 1e3 * (z - table.z), color="black", linewidth=1.2)
+    height = 1e3 * (z - table.z)
+    beside.plot(t, height, color="black", linewidth=1.2)
+    violated = np.where(np.abs(height) > band, height, np.nan)
+    beside.plot(t, violated, color=_GOAL, linewidth=2.5, label="_violated")
     beside.set(xlabel="t [s]", ylabel="z above the table [mm]", xlim=(t[0], t[-1]))
     beside.grid(color="0.9", linewidth=0.6)
 
