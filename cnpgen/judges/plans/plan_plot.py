@@ -31,6 +31,7 @@ if TYPE_CHECKING:
 TABLE_HEIGHT = "table height"  # drawn with the tip
 PLOT_SAMPLES = 1000  # in time
 DRAWN_STATES = 7  # at which the arm and the object are drawn
+MAX_NAMED_CURVES = 6  # more names would cover each other
 MAX_LEGEND_CHARACTERS = 115  # that fit above the curves
 _START, _BETWEEN, _GOAL, _LIMIT, _BOX = "tab:blue", "0.55", "tab:red", "0.25", "0.85"
 
@@ -281,9 +282,9 @@ def _draw_values(axis: "Axes", curve: ConditionCurve, t: Array) -> None:
     for values, part in zip(curve.values, curve.parts, strict=True):
         color, label = None if part else "black", part or None
         axis.plot(t, values, linewidth=1.2, color=color, label=label)
-        axis.annotate(
-            part, (t[0], values[0]), (2, 3), textcoords="offset points", fontsize=8
-        )
+        if len(curve.parts) <= MAX_NAMED_CURVES:
+            at = (t[0], values[0])
+            axis.annotate(part, at, (2, 3), textcoords="offset points", fontsize=8)
     # A bound of which the values stay far away is drawn, too.
     low, high = axis.get_ylim()
     for bound, side in ((curve.lower, -1), (curve.upper, 1)):
