@@ -174,15 +174,9 @@ class PoseTasks:
     def __init__(self, problem: Problem) -> None:
         self._problem, self.robot = problem, load_robot(problem)
         joints, axes = self.robot.joint_names, ("x", "y", "z")
-        unit = self.robot.units("rad")
+        unit, start = self.robot.units("rad"), "joint positions at the start, at rest"
         fields = (
-            Field(
-                "start_q",
-                unit,
-                "joint positions at the start, at rest",
-                len(joints),
-                joints,
-            ),
+            Field("start_q", unit, start, len(joints), joints),
             Field("goal_xyz", "m", "position of the tip at the goal", 3, axes),
             Field(
                 "goal_wxyz",

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -198,52 +199,25 @@ def solve_scenes(
         "solve_scenes", run, SceneOptions(), old_keywords, keyword="run"
     )
     check_scenes(scenes)
-    loaded, scenes = as_problem(problem), [checked_scene(scene) for scene in scenes]
-    robot = load_robot(loaded)
-    _check_initial(loaded, len(scenes), chosen.initial)
-    # Scenes are placed before the problem changes, since attached objects have poses in
-    # frames of links.
-    placed = [placed_scene(scene, robot, start_state(scene, robot)) for scene in scenes]
-    loaded, robot, scenes = requested_problem(
-        loaded, robot, placed, payload=chosen.payload
-    )
+    loaded, robot, scenes = _requested(as_problem(problem), scenes, chosen)
     goals = [_goals(loaded, robot, scene, index) for index, scene in enumerate(scenes)]
     if chosen.begin is not None:
         chosen.begin(len(scenes), 0)
-
-    def report(finished: int, valid: int) -> None:
-        if progress is not None and finished:
-            progress(finished, valid)
-
+    refine = _refiner(chosen, progress, options, workers=workers, discard=discard)
     capacity = capacity_of(scenes)
     found, times, journals = dict[int, tuple[Plans, Attempt]](), NO_TIME, list[Path]()
     # Scenes of one capacity share kernels; each group has its own journal.
     for own, indices in _groups(scenes):
         file = None if journal is None else Path(f"{journal}.{len(journals)}")
         journals += [] if file is None else [file]
-        refinement = refine_tasks(
-            _adjusted(
-                _plans_of(
-                    loaded, scenes, [(index, goals[index]) for index in indices], own
-                ),
-                chosen,
-            ),
-            options=options,
-            workers=workers,
-            engine=chosen.engine,
-            address=chosen.address,
-            journal=file,
-            discard=discard,
-            begin=lambda _, finished: report(finished, finished),
-            progress=report,
-        )
+        of_group = [(index, goals[index]) for index in indices]
+        plans = _adjusted(_plans_of(loaded, scenes, of_group, own), chosen)
+        refinement = refine(plans, journal=file)
         times += refinement.times
-        # All plans of one file have the same obstacles, so that smaller groups get
-        # parked ones.
+        # Plans of one file have the same obstacles: smaller groups get parked ones.
         wide = with_wider_capacity(_without_options(refinement), loaded, own, capacity)
-        for row, (index, attempt) in enumerate(
-            zip(indices, refinement.results, strict=True)
-        ):
+        attempts = zip(indices, refinement.results, strict=True)
+        for row, (index, attempt) in enumerate(attempts):
             found[index] = wide[row], _with_reason(attempt, goals[index])
     every, results = zip(*(found[index] for index in range(len(scenes))), strict=True)
     solved = SolvedScenes(tuple(scenes), concatenate(every), results, times)
@@ -251,6 +225,44 @@ def solve_scenes(
     for file in journals:
         file.unlink(missing_ok=True)
     return solved
+
+
+def _requested(
+    problem: Problem, scenes: Sequence[SceneProblem], run: SceneOptions
+) -> tuple[Problem, Robot, list[SceneProblem]]:
+    """Return the problem that scenes ask for, its robot, and the placed scenes."""
+    checked, robot = [checked_scene(scene) for scene in scenes], load_robot(problem)
+    _check_initial(problem, len(scenes), run.initial)
+    # Scenes are placed before the problem changes, since attached objects have poses in
+    # frames of links.
+    placed = [placed_scene(each, robot, start_state(each, robot)) for each in checked]
+    return requested_problem(problem, robot, placed, payload=run.payload)
+
+
+def _refiner(
+    run: SceneOptions,
+    progress: Progress | None,
+    options: RefineOptions,
+    *,
+    workers: int | None,
+    discard: bool,
+) -> Callable[..., Refinement]:
+    """Return ``refine_tasks`` with the options of a run; ``progress`` gets finished plans of all groups."""
+
+    def report(finished: int, valid: int) -> None:
+        if progress is not None and finished:
+            progress(finished, valid)
+
+    return partial(
+        refine_tasks,
+        options=options,
+        workers=workers,
+        engine=run.engine,
+        address=run.address,
+        discard=discard,
+        begin=lambda _, finished: report(finished, finished),
+        progress=report,
+    )
 
 
 def _check_initial(problem: Problem, count: int, initial: Plans | None) -> None:

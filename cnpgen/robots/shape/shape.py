@@ -234,28 +234,17 @@ def load_held_shape(
     """
     convex_parts, joints = place_convex_parts(urdf, model)
     if not joints:
-        raise RecipeError(
-            [
-                "no link has a <collision> element, so that contacts with the held object cannot be checked"
-            ]
-        )
+        text = "no link has a <collision> element, so that contacts with the held object cannot be checked"
+        raise RecipeError([text])
     for link in held.touch_links:
         if link not in joints:
-            raise RecipeError(
-                [
-                    f"object.touch_links: no link {link!r} has collision geometry{nearest(link, joints)}"
-                ]
-            )
+            text = f"no link {link!r} has collision geometry{nearest(link, joints)}"
+            raise RecipeError([f"object.touch_links: {text}"])
     tip = model.frames[tip_frame]
-    carrier = int(tip.parentJoint)
-    checked = [
-        link
-        for link in joints
-        if link not in held.touch_links and joints[link] != carrier
-    ]
-    box = _box(
-        held.size, np.array(tip.placement.rotation), np.array(tip.placement.translation)
-    )
+    carrier, pose = int(tip.parentJoint), tip.placement
+    moving = (link for link in joints if joints[link] != carrier)
+    checked = [link for link in moving if link not in held.touch_links]
+    box = _box(held.size, np.array(pose.rotation), np.array(pose.translation))
     parts = (*(part for part in convex_parts if part.link in checked), box)
     joints = {link: joints[link] for link in checked} | {HELD_OBJECT: carrier}
 
@@ -263,12 +252,8 @@ def load_held_shape(
         capsules = tuple(covering_capsule(_parts_of(link, parts)) for link in checked)
         return capsules, _compare(model, parts, capsules, joints)
 
-    about = [
-        HELD_OBJECT,
-        list(held.size),
-        list(held.touch_links),
-        tip.placement.homogeneous.tolist(),
-    ]
+    about = [HELD_OBJECT, list(held.size), list(held.touch_links)]
+    about.append(pose.homogeneous.tolist())
     capsules, pairs = _cached(keep, [urdf, *_joints_of(model), *about], parts, compute)
     if fixed := [pair.first for pair in pairs if pair.colliding > ALWAYS_FRACTION]:
         text = f"the held object overlaps {', '.join(fixed)} in nearly all of {SAMPLED_HELD_STATES:,} random states"
