@@ -8,7 +8,7 @@ accelerations are for review at most. Actions are targets, and only checked for 
 """
 
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from enum import StrEnum
 from itertools import islice
 from typing import Any
@@ -27,6 +27,7 @@ from cnpgen.addons.trajectories.lower_bounds import (
     MeanDerivatives,
     first_derivatives,
     second_derivatives,
+    swing_velocities,
     value_intervals,
 )
 from cnpgen.addons.trajectories.sample_errors import rounding, time_rounding
@@ -235,11 +236,15 @@ def _limit_findings(
             not_run[quantity] = "the zero of the joints is not known"
             continue
         worst = _worst(limit, samples.compared(quantity, limit, jitter))
-        if worst is None:
-            continue
         # Only limits of the vendor exclude, with a known noise, and not of
         # accelerations.
         proven = known and limit.basis == VENDOR and quantity != "acceleration"
+        if worst is None and quantity == "velocity":
+            # Over many frames, a recorder that falls behind explains the excess, too.
+            far, proven = replace(samples, lags=None), False
+            worst = _worst(limit, far.compared(quantity, limit, jitter))
+        if worst is None:
+            continue
         # A velocity that a stall of the recorder explains is for review.
         if proven and quantity == "velocity" and largest > jitter:
             of_stall = _worst(limit, samples.compared(quantity, limit, largest))
@@ -282,6 +287,11 @@ class _Samples:
             if limit.by_position is not None:
                 lower, upper = span_limits(q, lag, e, limit.by_position, upper)
             yield bounds, lower, upper
+        if quantity == "velocity" and jitter:
+            # Two spans of one frame are within two frames.
+            swings = swing_velocities(t, q, e, jitter)
+            for bounds in islice(swings, self.lags and self.lags // 2):
+                yield bounds, limit.lower, limit.upper
 
 
 def _noise(q: Array, arm: RecordedArm, noise: float | None) -> tuple[float, bool, str]:
