@@ -29,8 +29,8 @@ class _Help(argparse.RawDescriptionHelpFormatter):
         self._action_max_length = len("    make-dataset")
 
 
-class StoreOnce(argparse._StoreAction):
-    """Store the input that an option names, and refuse a second one, which would be lost."""
+class _StoreOnce(argparse._StoreAction):
+    """Store the value of an option, and refuse another one after it: one would be lost."""
 
     def __call__(
         self,
@@ -44,10 +44,11 @@ class StoreOnce(argparse._StoreAction):
         Raises:
             argparse.ArgumentError: The option has another value already.
         """
-        before = getattr(namespace, self.dest, self.default)
-        if option_string and before is not self.default and before != values:
+        assert isinstance(parser, Parser)
+        before = parser.given.setdefault(self.dest, values)
+        if option_string and before != values:
             raise argparse.ArgumentError(
-                self, f"names one input, got {before} and {values}"
+                self, f"given twice, {before} and {values}: expected once"
             )
         super().__call__(parser, namespace, values, option_string)
 
@@ -63,6 +64,10 @@ class Parser(argparse.ArgumentParser):
             **options,
         )
         self._negative_number_matcher = _NEGATIVE
+        # Groups of options share this registry: None is the action of most options.
+        self.register("action", None, _StoreOnce)
+        # Option -> its value.
+        self.given: dict[str, Any] = {}
 
     def error(self, message: str) -> NoReturn:
         """Raise UsageError with the error and the help command on one line."""

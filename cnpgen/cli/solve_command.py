@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from cnpgen.cli import recipe_names, values
-from cnpgen.cli.parser import EXTRAPOLATE, Parser, StoreOnce, options_of, refuse
+from cnpgen.cli.parser import EXTRAPOLATE, Parser, options_of, refuse
 from cnpgen.cli.refine_command import (
     ALLOW_UNUSED,
     LARGE_ANGLES,
@@ -72,7 +72,7 @@ def add_options(parser: Parser) -> None:
     )
     option("--start", metavar="Q1,Q2,...", type=values.positions, help=text)
     text = "plan file with a plan for each scene, before obstacles or ends moved a little: initial guesses"
-    option("--initial-plans", metavar="FILE", type=Path, action=StoreOnce, help=text)
+    option("--initial-plans", metavar="FILE", type=Path, help=text)
     text = (
         "end motions in scenes with zero acceleration, so that another one may follow"
     )

@@ -50,7 +50,11 @@ def read_octomap(
     message = part(world, "octomap", dict, place)
     tree = part(message, "octomap", dict, place)
     if not part(tree, "data", list, place):
-        mark_read(message)
+        # An empty map has no frame; other keys may be misspelt ones.
+        for key in ("header", "origin"):
+            mark_read(part(message, key, dict, place))
+        for key in ("id", "resolution", "binary"):
+            tree.get(key)
         return
     where = f"{place}: octomap"
     kind = part(tree, "id", str, where)

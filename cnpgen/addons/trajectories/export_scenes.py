@@ -7,7 +7,7 @@
 import argparse
 
 from cnpgen.cli import export_command, recipe_names
-from cnpgen.cli.parser import Options, StoreOnce
+from cnpgen.cli.parser import Options
 from cnpgen.errors import UsageError
 
 
@@ -18,7 +18,6 @@ def add_options(options: Options) -> None:
         "--scenes",
         metavar="FILE",
         type=recipe_names.present,
-        action=StoreOnce,
         help=text,
     )
 
