@@ -211,9 +211,21 @@ def options_of(arguments: argparse.Namespace, *names: str) -> dict[str, Any]:
 
 
 def refuse(arguments: argparse.Namespace, names: Sequence[str], why: str) -> None:
-    """Raise UsageError if one of some options was passed."""
-    if any(getattr(arguments, name) is not None for name in names):
-        raise UsageError(why)
+    """Raise UsageError if an option was passed that has no effect; ``{}`` stands for it in ``why``."""
+    for action in arguments.parser._actions:
+        name = action.dest
+        if name in names and getattr(arguments, name) != action.default:
+            # The long name, or that of a positional argument.
+            raise UsageError(
+                why.replace("{}", (*action.option_strings[-1:], action.metavar)[0])
+            )
+
+
+def refuse_others(arguments: argparse.Namespace, *names: str) -> None:
+    """Raise UsageError for all options but some, the first of which is without effect of others."""
+    known = {*names, "run", "parser", "json", "quiet", "verbose"}
+    others = [name for name in vars(arguments) if name not in known]
+    refuse(arguments, others, f"{{}} has no effect with --{names[0]}")
 
 
 def add_json(parser: Parser) -> None:

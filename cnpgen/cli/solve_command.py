@@ -29,6 +29,8 @@ from cnpgen.cli.refine_command import (
 )
 from cnpgen.errors import DatasetError, UsageError, listed
 
+STAY_WITHIN = "{} needs the path of a plan: 'cnpgen refine', a dataset made with --certify, or --initial-plans"
+
 if TYPE_CHECKING:
     from cnpgen.make.solve_scenes import SolvedScenes
     from cnpgen.plans import Plans
@@ -106,6 +108,8 @@ def run(arguments: argparse.Namespace) -> int:
     problems = _problems(arguments)
     # Rows of certified datasets have plans.
     make = refine_plans if math.isfinite(problems.duration[0]) else solve_plans
+    if make is solve_plans:
+        refuse(arguments, ["stay_within"], STAY_WITHIN)
     return refine_and_save(
         arguments, problems, out, title=f"solving {arguments.what}", make=make
     )
@@ -120,9 +124,11 @@ def _solve_scenes(arguments: argparse.Namespace, out: Path) -> int:
 
     refuse(
         arguments,
-        ["split", "seed", "problem", "extrapolate"],
-        "--split, --seed, --problem and --extrapolate are not for scenes (--robot), which have --first and --n",
+        ["split", "seed", "problem", "extrapolate", "allow_large_angles"],
+        "{} is not for scenes (--robot), which have --first and --n",
     )
+    if arguments.initial_plans is None:
+        refuse(arguments, ["stay_within"], STAY_WITHIN)
     problem = as_problem(arguments.robot)
     joints, positions = problem.robot.joints, arguments.start or ()
     if positions and len(positions) != len(joints):
@@ -189,8 +195,7 @@ def _problems(arguments: argparse.Namespace) -> "Plans":
             "initial_plans",
             "smooth_stop",
         ],
-        "--allow-unused, --payload, --start, --packages, --initial-plans and --smooth-stop are for scenes,"
-        " which need --robot",
+        "{} is for scenes, which need --robot",
     )
     what = Path(arguments.what)
     kind = file_kind(what)
@@ -219,8 +224,8 @@ def _rows(arguments: argparse.Namespace) -> "Plans":
     )
     refuse(
         arguments,
-        ["problem", "extrapolate"],
-        "--problem and --extrapolate are for boundary conditions in HDF5; a dataset contains its problem",
+        ["problem", "extrapolate", "allow_large_angles"],
+        "{} is for boundary conditions in HDF5; a dataset contains its problem",
     )
     split = arguments.split or "validation"
     return load_boundary_problems(
@@ -234,7 +239,7 @@ def _conditions(arguments: argparse.Namespace) -> "Plans":
     refuse(
         arguments,
         ["split", "first", "n"],
-        "--split, --first and --n need the folder of a dataset, got a file",
+        "{} needs the folder of a dataset, got a file",
     )
     refuse(
         arguments,
@@ -258,12 +263,14 @@ def _draws(arguments: argparse.Namespace) -> "Plans":
 
     recipe_names.check_recipe(arguments.what)
     recipe = load_dataset_recipe(arguments.what)
-    of_rows = "--split and --first need the folder of a dataset; samples drawn from a recipe have --seed"
+    of_rows = (
+        "{} needs the folder of a dataset; samples drawn from a recipe have --seed"
+    )
     refuse(arguments, ["split", "first"], of_rows)
     refuse(
         arguments,
-        ["problem", "extrapolate"],
-        "--problem and --extrapolate are for boundary conditions in HDF5; a recipe contains its problem",
+        ["problem", "extrapolate", "allow_large_angles"],
+        "{} is for boundary conditions in HDF5; a recipe contains its problem",
     )
     if arguments.n is None:
         raise UsageError(

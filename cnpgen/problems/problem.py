@@ -428,7 +428,8 @@ class Problem:
         if not self.is_stored:
             # The reader of the robot raises errors about the text itself.
             with suppress(ValueError):
-                check_elements(urdf_tree(text), self.urdf_path)
+                tree, names = urdf_tree(text), spec.allow_unused
+                check_elements(tree, self.urdf_path, allow_unused=names)
         text = with_locked_joints(text, positions, is_stored=self.is_stored)
         text = with_point_masses(text)
         # Meshes need not exist where no constraint uses the geometry.
@@ -448,11 +449,9 @@ class Problem:
             links=spec.decomposed,
             keep=keep,
         )
-        text = (
-            with_disabled_pairs(text, self.path.parent / spec.srdf)
-            if spec.srdf
-            else text
-        )
+        if spec.srdf:
+            srdf = self.path.parent / spec.srdf
+            text = with_disabled_pairs(text, srdf, allow_unused=spec.allow_unused)
         ignored = spec.ignored_pairs
         text = with_payload_link(text, spec, self.payload, is_stored=self.is_stored)
         if self.payload is not None:

@@ -26,6 +26,7 @@ MIN_CHUNK_SAMPLES = 8  # of a chunk after the join: fewer have no reliable veloc
 MAX_DURATION = 1.2  # of a motion, in chunk lengths
 SAMPLE_ROUNDING = 1e-6  # samples
 NOISE_RAD = 1e-3
+TIMES_S = 1e-3, 60.0  # range of options
 MAX_RESTING_SPEED = 0.05  # fraction of the velocity limits, of an arm that is at rest
 
 
@@ -38,6 +39,9 @@ class ChunkOptions:
             no motion within it meets the limits of velocities, accelerations and jerks.
         stop_after: Time after a join at which the arm rests at the latest without
             another chunk [s]; by default 1.2 chunk lengths. Later samples are not used.
+
+    Raises:
+        UsageError: A value has another type, or is outside of its range.
     """
 
     noise: float = NOISE_RAD
@@ -45,6 +49,11 @@ class ChunkOptions:
 
     def __post_init__(self) -> None:
         check_fields(self)
+        if number("noise", self.noise) <= 0:
+            text = f"must be positive, got {self.noise:g}"
+            raise UsageError(text, argument="noise")
+        if self.stop_after is not None:
+            bounded("stop_after", self.stop_after, *TIMES_S, "s")
 
 
 class ChunkChecks:

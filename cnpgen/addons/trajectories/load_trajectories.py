@@ -29,12 +29,14 @@ from cnpgen.problems.problem_record import (
     open_problem,
 )
 from cnpgen.problems.scenes.scene_problem import SceneProblem
+from cnpgen.problems.scenes.scene_reader import ReadingOptions
 from cnpgen.robots.parameter_ranges import PARAMETER_UNITS
 from cnpgen.robots.plausible_values import UnitError, find_implausible_value
 from cnpgen.robots.robot import Robot
 from cnpgen.schema.argument_types import checked_arguments
 from cnpgen.schema.old_keywords import with_old_keywords
 from cnpgen.store.dataset_spec import StoredProblem
+from cnpgen.store.files.accounted import check_allowed, unmatched
 
 
 @dataclass(frozen=True, eq=False)
@@ -138,13 +140,22 @@ def load_trajectories(
     for reader, trajectory in zip(readers, trajectories, strict=True):
         reader.check_units(trajectory)
     ignored = dict.fromkeys(name for reader in readers for name in reader.unused())
+    # Keys of messages may be missing in scenes; the other ones must be there.
+    keys = unmatched(chosen.allow_unused, list(ignored))
+    if scenes is None:
+        check_allowed(keys, [], ignored)
     if chosen.extrapolate:
         values = [each.parameters for each in trajectories]
         stated = [row for row in values if row is not None]
         record = extrapolated_record(record, np.array(stated)) if stated else record
     if scenes is not None:
         record, trajectories = with_scenes(
-            record, trajectories, scenes, allow_unused=chosen.allow_unused
+            record,
+            trajectories,
+            scenes,
+            options=ReadingOptions(
+                keys, allowed_elsewhere=sorted({*chosen.allow_unused}.difference(keys))
+            ),
         )
     return LoadedTrajectories(
         record,

@@ -161,12 +161,11 @@ def _check_message(message: Mapping[str, Any], place: str) -> None:
             )
     for name in _STARTS:
         state = message.get(name)
-        if isinstance(state, dict):
-            if state.get("attached_collision_objects"):
-                raise UsageError(
-                    f"{place}: {name} has attached objects: {{scenes}} gives a scene with them",
-                    remedies={"scenes": None},
-                )
+        if isinstance(state, dict) and state.get("attached_collision_objects"):
+            raise UsageError(
+                f"{place}: {name} has attached objects: {{scenes}} gives a scene with them",
+                remedies={"scenes": None},
+            )
     code = message.get("error_code", {"val": _SUCCESS})
     value = code.get("val") if isinstance(code, dict) else code
     if value != _SUCCESS:
