@@ -185,8 +185,9 @@ def read_columns(
 
 
 def check_values(shard: Shard, columns: Mapping[str, NDArray[Any]]) -> None:
-    """Raise DatasetError for values that are not finite, parameters out of range, and sample IDs that are not the indices of the rows."""
-    if problem := finite_problem(columns) or _range_problem(shard.spec, columns):
+    """Raise DatasetError for values that are not finite, parameters out of range, and wrong sample IDs."""
+    problem = finite_problem(columns) or _range_problem(shard.spec, columns)
+    if problem:
         raise DatasetError(f"{shard.path}: {problem}")
     ids = columns.get(SAMPLE_ID)
     if ids is not None and not np.array_equal(
