@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from cnpgen.addons.scene_files.moveit_collisions import is_true
 from cnpgen.addons.scene_files.moveit_frames import (
     FrameTable,
     composed,
@@ -72,7 +73,7 @@ def read_octomap(
         raise SceneError(f"{where}: data must be bytes")
     # Messages have signed bytes, octrees unsigned ones.
     data = (values.astype(int) % 256).astype(np.uint8).tobytes()
-    is_binary = str(tree.get("binary", "false")).strip().lower() in {"true", "1", "1.0"}
+    is_binary = is_true(tree.get("binary"), f"{where}: binary")
     cells = decoded_cells(data, is_binary=is_binary, where=where)
     frame, pose = table.resolve(
         frame_id(message, where),
