@@ -49,6 +49,9 @@ if TYPE_CHECKING:
     from cnpgen.planner.plan_requests import Requests
 
 
+_OF_FILES = "{} is for files of boundary conditions or scenes"
+
+
 def add_options(parser: Parser) -> None:
     option = parser.add_argument
     text = "a dataset's folder; a dataset or pipeline by name, or a recipe file; boundary conditions in HDF5; or scenes"
@@ -160,14 +163,8 @@ def _complete(arguments: argparse.Namespace) -> None:
             raise UsageError(
                 f"the following arguments are required: {option}; see 'cnpgen plan --help'"
             )
-    refining = options_of(arguments, *ENGINE, "explain", *REFINING)
-    lost = [
-        name
-        for name, value in refining.items()
-        if value != arguments.parser.get_default(name)
-    ]
-    if lost and not arguments.refine:
-        raise UsageError(f"--{lost[0].replace('_', '-')} needs --refine")
+    if not arguments.refine:
+        refuse(arguments, (*ENGINE, "explain", *REFINING), "{} needs --refine")
     check_free(arguments.out, force=arguments.force, unless_finished=True)
 
 
@@ -185,7 +182,9 @@ def _requests(arguments: argparse.Namespace, model: "Model") -> "Requests":
     problems = Path(arguments.problems)
     if problems.exists() and holds_scenes(problems):
         return _scenes(arguments, model)
+    refuse(arguments, ["allow_unused"], f"{{}} is for scenes, got {problems}")
     if problems.is_dir():
+        refuse(arguments, ["allow_large_angles"], _OF_FILES)
         return read_rows(
             problems,
             model,
@@ -196,8 +195,8 @@ def _requests(arguments: argparse.Namespace, model: "Model") -> "Requests":
         )
     refuse(
         arguments,
-        ["split", "first", "n", "allow_unused"],
-        "--split, --first and --n need the folder of a dataset, --allow-unused needs scenes, got a file",
+        ["split", "first", "n"],
+        "{} needs the folder of a dataset, got a file",
     )
     return read_file(
         problems,
@@ -212,10 +211,11 @@ def _scenes(arguments: argparse.Namespace, model: "Model") -> "Requests":
     from cnpgen.planner.plan_requests import scene_requests
     from cnpgen.problems.scenes.scene_reader import ReadingOptions, read_scenes
 
-    if arguments.split is not None or arguments.other_rows:
-        raise UsageError(
-            "--split and --other-rows are for datasets; scenes have --first and --n"
-        )
+    refuse(
+        arguments,
+        ["split", "other_rows"],
+        "{} is for datasets; scenes have --first and --n",
+    )
     return scene_requests(
         model,
         read_scenes(
@@ -242,8 +242,12 @@ def _draws(arguments: argparse.Namespace, model: "Model") -> "Requests":
     from cnpgen.store.files.documents import plain
 
     name = arguments.problems
-    of_rows = "--split and --first need the folder of a dataset; samples drawn from a recipe have --seed"
+    of_rows = (
+        "{} needs the folder of a dataset; samples drawn from a recipe have --seed"
+    )
     refuse(arguments, ["split", "first"], of_rows)
+    refuse(arguments, ["allow_unused"], "{} is for scenes, got a recipe")
+    refuse(arguments, ["allow_large_angles"], _OF_FILES)
     if arguments.n is None:
         raise UsageError(
             f"--n is required: the number of fresh problems of the recipe {name}"

@@ -19,14 +19,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from cnpgen.cli import recipe_names, values
-from cnpgen.cli.parser import (
-    EXTRAPOLATE,
-    Parser,
-    StoreOnce,
-    add_selection,
-    options_of,
-    refuse,
-)
+from cnpgen.cli.parser import EXTRAPOLATE, Parser, add_selection, options_of, refuse
 from cnpgen.cli.refine_command import (
     ALLOW_UNUSED,
     LARGE_ANGLES,
@@ -35,6 +28,8 @@ from cnpgen.cli.refine_command import (
     refine_and_save,
 )
 from cnpgen.errors import DatasetError, UsageError, listed
+
+STAY_WITHIN = "{} needs the path of a plan: 'cnpgen refine', a dataset made with --certify, or --initial-plans"
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -82,7 +77,7 @@ def _add_scenes(parser: Parser) -> None:
     )
     option("--start", metavar="Q1,Q2,...", type=values.positions, help=text)
     text = "plan file with a plan for each scene, before obstacles or ends moved a little: initial guesses"
-    option("--initial-plans", metavar="FILE", type=Path, action=StoreOnce, help=text)
+    option("--initial-plans", metavar="FILE", type=Path, help=text)
     text = (
         "end motions in scenes with zero acceleration, so that another one may follow"
     )
@@ -104,6 +99,8 @@ def run(arguments: argparse.Namespace) -> int:
     problems = _problems(arguments)
     # Rows of certified datasets have plans.
     make = refine_plans if math.isfinite(problems.duration[0]) else solve_plans
+    if make is solve_plans:
+        refuse(arguments, ["stay_within"], STAY_WITHIN)
     return refine_and_save(
         arguments, problems, out, title=f"solving {arguments.what}", make=make
     )
@@ -115,8 +112,13 @@ def _solve_scenes(arguments: argparse.Namespace, out: Path) -> int:
     from cnpgen.make.solve_scenes import SceneOptions, solve_scenes
     from cnpgen.problems.problem_record import as_problem, record_problem
 
-    text = "--split, --seed, --problem and --extrapolate are not for scenes (--robot), which have --first and --n"
-    refuse(arguments, ["split", "seed", "problem", "extrapolate"], text)
+    refuse(
+        arguments,
+        ["split", "seed", "problem", "extrapolate", "allow_large_angles"],
+        "{} is not for scenes (--robot), which have --first and --n",
+    )
+    if arguments.initial_plans is None:
+        refuse(arguments, ["stay_within"], STAY_WITHIN)
     problem = as_problem(arguments.robot)
     scenes = _scenes(arguments, problem.robot.joints)
     record, initial = record_problem(problem), None
@@ -186,8 +188,7 @@ def _problems(arguments: argparse.Namespace) -> "Plans":
             "initial_plans",
             "smooth_stop",
         ],
-        "--allow-unused, --payload, --start, --packages, --initial-plans and --smooth-stop are for scenes,"
-        " which need --robot",
+        "{} is for scenes, which need --robot",
     )
     what = Path(arguments.what)
     kind = file_kind(what)
@@ -216,8 +217,8 @@ def _rows(arguments: argparse.Namespace) -> "Plans":
     )
     refuse(
         arguments,
-        ["problem", "extrapolate"],
-        "--problem and --extrapolate are for boundary conditions in HDF5; a dataset contains its problem",
+        ["problem", "extrapolate", "allow_large_angles"],
+        "{} is for boundary conditions in HDF5; a dataset contains its problem",
     )
     split = arguments.split or "validation"
     return load_boundary_problems(
@@ -231,7 +232,7 @@ def _conditions(arguments: argparse.Namespace) -> "Plans":
     refuse(
         arguments,
         ["split", "first", "n"],
-        "--split, --first and --n need the folder of a dataset, got a file",
+        "{} needs the folder of a dataset, got a file",
     )
     refuse(
         arguments,
@@ -255,12 +256,14 @@ def _draws(arguments: argparse.Namespace) -> "Plans":
 
     recipe_names.check_recipe(arguments.what)
     recipe = load_dataset_recipe(arguments.what)
-    of_rows = "--split and --first need the folder of a dataset; samples drawn from a recipe have --seed"
+    of_rows = (
+        "{} needs the folder of a dataset; samples drawn from a recipe have --seed"
+    )
     refuse(arguments, ["split", "first"], of_rows)
     refuse(
         arguments,
-        ["problem", "extrapolate"],
-        "--problem and --extrapolate are for boundary conditions in HDF5; a recipe contains its problem",
+        ["problem", "extrapolate", "allow_large_angles"],
+        "{} is for boundary conditions in HDF5; a recipe contains its problem",
     )
     if arguments.n is None:
         raise UsageError(

@@ -19,6 +19,7 @@ from cnpgen.plans.plausible import check_boundary_units
 from cnpgen.problems.obstacles import goal_velocities, scene_of
 from cnpgen.problems.problem import Problem
 from cnpgen.problems.problem_record import ProblemRecord, as_record, open_problem
+from cnpgen.robots.parameter_ranges import EXTRAPOLATE
 from cnpgen.robots.scene import Scene
 from cnpgen.schema.argument_types import check_fields, checked_arguments
 from cnpgen.schema.arguments import check_memory, integer, numbers, reject_masked
@@ -87,7 +88,8 @@ class Plans:
             # The message compares each field with the number of plans that most fields
             # have.
             argument, text = next(_errors(self, _rows(self)))
-            raise UsageError(text, concerns=argument)
+            remedies = EXTRAPOLATE if "{extrapolate}" in text else None
+            raise UsageError(text, concerns=argument, remedies=remedies)
 
     def __len__(self) -> int:
         return len(self.path_control_points)

@@ -428,7 +428,8 @@ class Problem:
         if not self.is_stored:
             # The reader of the robot raises errors about the text itself.
             with suppress(ValueError):
-                check_elements(urdf_tree(text), self.urdf_path)
+                tree, names = urdf_tree(text), spec.allow_unused
+                check_elements(tree, self.urdf_path, allow_unused=names)
         text = with_locked_joints(text, positions, is_stored=self.is_stored)
         text = with_point_masses(text)
         # Meshes need not exist where no constraint uses the geometry.
@@ -447,7 +448,8 @@ class Problem:
             keep=kept_folder() if spec.convex_parts > 1 else None,
         )
         if spec.srdf:
-            text = with_disabled_pairs(text, self.path.parent / spec.srdf)
+            srdf = self.path.parent / spec.srdf
+            text = with_disabled_pairs(text, srdf, allow_unused=spec.allow_unused)
         text = with_payload_link(text, spec, self.payload, is_stored=self.is_stored)
         # Links that hold the payload touch it in every state.
         touching = () if self.payload is None else self.payload.touch_links

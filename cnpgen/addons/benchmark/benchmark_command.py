@@ -19,7 +19,15 @@ from typing import TYPE_CHECKING, Any
 
 from cnpgen.cli import recipe_names, values
 from cnpgen.cli.interruption import resumable
-from cnpgen.cli.parser import ENGINE, Parser, add_engine, add_json, options_of
+from cnpgen.cli.parser import (
+    ENGINE,
+    Parser,
+    add_engine,
+    add_json,
+    options_of,
+    refuse,
+    refuse_others,
+)
 from cnpgen.cli.terminal import Meter, table
 from cnpgen.errors import CnpgenError, UsageError
 
@@ -159,15 +167,16 @@ def run(arguments: argparse.Namespace) -> None:
     from cnpgen.addons.benchmark.result_tables import save_benchmark_tables
 
     if arguments.list:
+        refuse_others(arguments, "list")
         print(_listing(as_json=arguments.json))
         return
     if arguments.suite is None:
         raise UsageError(
             "the argument SUITE is missing; 'cnpgen benchmark --list' lists suites"
         )
-    for name in ("plant", "environment", "video"):
-        if getattr(arguments, name) and not arguments.simulate:
-            raise UsageError(f"--{name} needs --simulate")
+    if not arguments.simulate:
+        names = ("plant", "environment", "video")
+        refuse(arguments, names, "{} needs --simulate")
     folder = arguments.out or Path(f"{Path(arguments.suite).stem}-results")
     found = _run(arguments, folder)
     save_benchmark_tables(found, folder)

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from cnpgen.cli import recipe_names, values
-from cnpgen.cli.parser import Parser, add_json
+from cnpgen.cli.parser import Parser, add_json, refuse
 from cnpgen.cli.terminal import Meter, table
 from cnpgen.errors import UsageError, counted
 
@@ -99,6 +99,8 @@ def _add_outputs(parser: Parser) -> None:
 def run(arguments: argparse.Namespace) -> int:
     from cnpgen.addons.benchmark.simulator.simulate import simulate_plans
 
+    if not (arguments.image or arguments.video):
+        refuse(arguments, ["plan"], "{} needs --image or --video")
     plans = recipe_names.read_plans(arguments.file, problem=arguments.problem)
     if arguments.plan >= len(plans):
         raise UsageError(

@@ -18,7 +18,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from cnpgen.cli.parser import Parser
+from cnpgen.cli.parser import Parser, refuse_others
 from cnpgen.cli.recipe_names import check_absent
 from cnpgen.errors import UsageError
 
@@ -65,6 +65,8 @@ def add_options(parser: Parser) -> None:
     option("--collision-from-visual", action="store_true", help=text)
     text = "leave out the collision meshes of a link, such as a broken one; may be repeated"
     option("--skip-mesh", metavar="LINK", action="append", default=[], help=text)
+    text = "leave elements or attributes of this name in URDF or SRDF unused that resemble known ones; may be repeated"
+    option("--allow-unused", metavar="KEY", action="append", default=[], help=text)
     option("--force", action="store_true", help="overwrite existing files")
 
 
@@ -75,6 +77,7 @@ def run(arguments: argparse.Namespace) -> None:
 
     folder = arguments.name
     if arguments.planner:
+        refuse_others(arguments, "planner", "name", "force")
         _write_planner(folder, force=arguments.force)
         return
     check_absent(folder, FILES, force=arguments.force)
@@ -93,6 +96,7 @@ def run(arguments: argparse.Namespace) -> None:
             packages,
             arguments.srdf,
             skipped_meshes=tuple(arguments.skip_mesh),
+            allow_unused=tuple(arguments.allow_unused),
             joint_limits=limits,
         )
         _write(folder, {FILES[0]: problem_text(initial, folder)})

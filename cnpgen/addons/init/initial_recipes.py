@@ -36,7 +36,11 @@ from cnpgen.problems.problem import Problem
 from cnpgen.robots.drive import NO_DRIVE, DriveSpec
 from cnpgen.robots.robot import Robot
 from cnpgen.robots.robot_spec import LimitSpec, RobotSpec
+from cnpgen.robots.urdf import read_urdf, urdf_tree
+from cnpgen.robots.urdf_changes import SRDF_NAMES
+from cnpgen.robots.urdf_elements import unknown_names
 from cnpgen.schema.keys import PerJoint, Range
+from cnpgen.store.files.accounted import check_allowed
 
 # Range of inverse kinematics guesses around the base configuration.
 GUESS_RANGE_RAD, GUESS_RANGE_M = 0.5, 0.1
@@ -69,17 +73,22 @@ def problem_of(
     srdf: Path | None,
     *,
     skipped_meshes: tuple[str, ...] = (),
+    allow_unused: tuple[str, ...] = (),
     joint_limits: StatedJointLimits | None = None,
 ) -> InitialProblem:
     """Make the problem of an arm, or raise RecipeError if it cannot be planned for.
 
     ``packages`` are folders that are searched for packages of the URDF, the SRDF
     disables pairs of links, and collision meshes of skipped links are left out.
+    Elements and attributes of both files with the names of ``allow_unused`` are not
+    read.
     """
     placeholder = with_torques(arm, [1.0] * len(arm.planned))
+    _check_allowed(allow_unused, arm.urdf, srdf)
     problem = _problem(
         placeholder, name, folder, packages, srdf, skipped_meshes=skipped_meshes
     )
+    problem = replace(problem, robot=replace(problem.robot, allow_unused=allow_unused))
     # Such as those about simplified meshes.
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
@@ -113,6 +122,14 @@ def _with_torque(problem: Problem, robot: Robot) -> tuple[Problem, tuple[str, ..
     limit = JointTorque(tolerance=5e-3, budget=6e-2)
     constraints = (*problem.constraint[:4], limit, *problem.constraint[4:])
     return replace(problem, constraint=constraints), ()
+
+
+def _check_allowed(keys: tuple[str, ...], urdf: Path, srdf: Path | None) -> None:
+    """Raise UsageError for names that neither file has as those of parts that are not read."""
+    unread = unknown_names(urdf_tree(read_urdf(urdf)))
+    if srdf is not None and keys:
+        unread += unknown_names(urdf_tree(read_urdf(srdf)), SRDF_NAMES)
+    check_allowed(keys, unread)
 
 
 def dataset_of(initial: InitialProblem, folder: Path) -> tuple[DatasetRecipe, float]:

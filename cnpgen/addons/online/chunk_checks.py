@@ -40,6 +40,9 @@ class ChunkOptions:
             no motion within it meets the limits of velocities, accelerations and jerks.
         stop_after: Time after a join at which the arm rests at the latest without
             another chunk [s]; by default 1.2 chunk lengths. Later samples are not used.
+
+    Raises:
+        UsageError: A value has another type, or is outside of its range.
     """
 
     noise: float = NOISE_RAD

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from cnpgen.cli import recipe_names, values
-from cnpgen.cli.parser import Options, StoreOnce, options_of
+from cnpgen.cli.parser import Options, options_of
 from cnpgen.cli.terminal import table
 from cnpgen.cli.verdict_text import margin_cells, margin_head
 from cnpgen.errors import UsageError, counted, listed
@@ -90,11 +90,10 @@ def add_trajectory_options(option: Options) -> None:
         "--scenes",
         metavar="FILE",
         type=recipe_names.present,
-        action=StoreOnce,
         help=text,
     )
     text = "topic of a bag of ROS, if several have trajectories"
-    add("--topic", metavar="NAME", action=StoreOnce, help=text)
+    add("--topic", metavar="NAME", help=text)
     text = "element of a message or scene that may be left unused; may be repeated"
     add("--allow-unused", metavar="KEY", action="append", help=text)
     text = "body at the tip, in place of the problem's: mass [kg], or mass and centre of mass in the tip frame [m]"
