@@ -260,7 +260,8 @@ def summary(trained: "Trained") -> str:
     return _fitted(
         f"trained {steps} in {training['cpu_seconds']:.0f} s of CPU time and"
         f" {training['validation_cpu_seconds']:.0f} s for validations; this run took {trained.times};"
-        f" the model of step {best} is kept: {words}"
+        f" the model of step {best} is kept: {words}; goal_acceleration ="
+        f" {trained.model.goal_acceleration!r}"
     )
 
 

@@ -206,13 +206,21 @@ def _acceleration_factor(part: Plans, robot: Robot) -> float:
     )
 
 
+def _law_grid(law: TimeLaw) -> Array:
+    """Return the edges of cells from 0 to the duration of a time law [s]; w has no kink within a cell."""
+    rise, fall = law.duration * law.rise, law.duration * law.fall
+    # A polynomial over a kink of the acceleration would exceed both of its ends.
+    ramp, level = grid(rise), rise + grid(law.duration - rise - fall)
+    return np.concatenate([ramp[:-1], level[:-1], law.duration - grid(fall)[::-1]])
+
+
 def retimed(motion: SampledMotion, law: TimeLaw) -> SampledMotion:
     """Return the motion that leaves another one at ``law.start`` and rests at ``law.end``.
 
     Before the law begins, it is the given motion.
     """
     assert motion.plan is not None
-    times = grid(law.duration)
+    times = _law_grid(law)
     u, brake, travel = shape_at(times / law.duration, law.rise, law.fall)
     sigma = law.start + law.duration * travel
     # A law may end where the path ends.
