@@ -14,6 +14,7 @@ import numpy as np
 
 from cnpgen.arrays import Array
 from cnpgen.errors import RecipeError, nearest
+from cnpgen.machine.threads import one_thread
 from cnpgen.robots.chain import Chain, frame_of
 from cnpgen.robots.robot_spec import HeldObject
 from cnpgen.robots.shape.capsule import Capsule, covering_capsule, covers
@@ -42,6 +43,9 @@ Size = tuple[float, float, float]
 # Of the computation of capsules and pairs; cached results of another revision are
 # ignored.
 SHAPE_REVISION = 1
+# Entries of the package for the robots of shipped problems, so that their first use
+# computes nothing; ``tests/kernels/make_shipped_tapes.py`` writes them.
+SHIPPED = Path(__file__).with_name("shipped")
 HELD_OBJECT = "held object"  # takes the place of a link's name
 SAMPLED_HELD_STATES = 2000  # states in which the object and the links are compared
 
@@ -140,17 +144,21 @@ def _cached(
     convex_parts: Parts,
     compute: Callable[[], tuple[Capsules, Pairs]],
 ) -> tuple[Capsules, Pairs]:
-    """Return capsules, which must cover the parts, and pairs from a cache folder, or compute and store them.
+    """Return capsules, which must cover the parts, and pairs: shipped, from a cache folder, or computed and stored.
 
-    The JSON values determine the result. Without a folder, it is computed.
+    The JSON values determine the result.
     """
     name = f"shape-{hashlib.sha256(json.dumps([SHAPE_REVISION, *numbers]).encode()).hexdigest()[:32]}.json"
-    if keep is not None and (entry := read_entry(keep / name)) is not None:
-        with suppress(ValueError, KeyError, TypeError, RecursionError):
-            # The cache is not trusted: capsules must cover the parts, or they are
-            # computed again.
-            return _read(json.loads(entry), convex_parts)
-    capsules, pairs = compute()
+    for folder in (SHIPPED, keep):
+        if folder is not None and (entry := read_entry(folder / name)) is not None:
+            with suppress(ValueError, KeyError, TypeError, RecursionError):
+                # The cache is not trusted: capsules must cover the parts, or they are
+                # computed again.
+                return _read(json.loads(entry), convex_parts)
+    # Sums of matrix products, and so the last digits, would depend on the number of
+    # threads.
+    with one_thread():
+        capsules, pairs = compute()
     if keep is not None:
         write_entry(keep / name, json.dumps(_written(capsules, pairs)).encode())
     return capsules, pairs
