@@ -13,9 +13,11 @@ from numpy.typing import NDArray
 
 from cnpgen.arrays import Array
 from cnpgen.errors import UsageError, counted
+from cnpgen.machine.engine import Engine
 from cnpgen.machine.times import NO_TIME, Times
 from cnpgen.make.goal_poses import (
     MAX_GOAL_STATES,
+    MAX_TREE_GOALS,
     POSE_REASON,
     POSE_SEEDS,
     EndConditions,
@@ -178,7 +180,8 @@ def solve_scenes(
     Scenes with equal numbers of obstacles of each kind, rounded up to multiples of
     four, share compiled kernels. Of several goal states, the ``MAX_GOAL_STATES``
     collision-free ones with the fastest straight lines are tried, and the result is the
-    best valid motion to any of them. A goal pose without goal states gets some by
+    best valid motion to any of them; with a time limit ``MAX_TREE_GOALS``, and the first
+    valid motion. A goal pose without goal states gets some by
     inverse kinematics; a scene for which it finds none is not solved, with the reason
     "no inverse kinematics of the goal".
 
@@ -200,7 +203,12 @@ def solve_scenes(
     )
     check_scenes(scenes)
     loaded, robot, scenes = _requested(as_problem(problem), scenes, chosen)
-    goals = [_goals(loaded, robot, scene, index) for index, scene in enumerate(scenes)]
+    # One tree has all goals as roots; without a limit each of them is optimized.
+    most = MAX_GOAL_STATES if options.time_limit is None else MAX_TREE_GOALS
+    goals = [
+        _goals(loaded, robot, scene, index, most=most)
+        for index, scene in enumerate(scenes)
+    ]
     if chosen.begin is not None:
         chosen.begin(len(scenes), 0)
     refine = _refiner(chosen, progress, options, workers=workers, discard=discard)
@@ -256,9 +264,7 @@ def _refiner(
     return partial(
         refine_tasks,
         options=options,
-        workers=workers,
-        engine=run.engine,
-        address=run.address,
+        engine=Engine(run.engine, run.address, workers),
         discard=discard,
         begin=lambda _, finished: report(finished, finished),
         progress=report,
@@ -348,20 +354,22 @@ def _plans_of(
     )
 
 
-def _goals(problem: Problem, robot: Robot, scene: SceneProblem, index: int) -> Array:
-    """Return the goal states of a scene that are tried, in this order, shape (G, n), G > 0."""
+def _goals(
+    problem: Problem, robot: Robot, scene: SceneProblem, index: int, *, most: int
+) -> Array:
+    """Return at most so many goal states of a scene that are tried, in this order, shape (G, n), G > 0."""
     if scene.goal_pose is not None:
         _frame_of(robot, scene, scene.goal_pose)
     if scene.other_goal_poses:
-        return _of_alternatives(problem, robot, scene, index)
+        return _of_alternatives(problem, robot, scene, index, most=most)
     if not len(scene.goal_q):
-        return _states_of_pose(problem, robot, scene, index)
+        return _states_of_pose(problem, robot, scene, index, most=most)
     states = goal_states(scene, robot)
     below, above = goal_tolerances(scene, robot)
     widths = below + above
     # A single exact goal state leaves no choice.
     if robot.shape is None or (len(states) == 1 and not widths.any()):
-        return states[:MAX_GOAL_STATES]
+        return states[:most]
     valid = _valid_ends(problem, robot, scene, states)
     if not len(valid) and widths.any():
         # The exact goal states are preferred; states within the tolerances are tried
@@ -369,7 +377,7 @@ def _goals(problem: Problem, robot: Robot, scene: SceneProblem, index: int) -> A
         near = _states_within(states, below, above, robot=robot, index=index)
         valid = _valid_ends(problem, robot, scene, near)
     start = start_state(scene, robot)
-    return nearest_states(valid, start, robot) if len(valid) else states[:1]
+    return nearest_states(valid, start, robot, most=most) if len(valid) else states[:1]
 
 
 def _valid_ends(
@@ -383,7 +391,7 @@ def _valid_ends(
 
 
 def _of_alternatives(
-    problem: Problem, robot: Robot, scene: SceneProblem, index: int
+    problem: Problem, robot: Robot, scene: SceneProblem, index: int, *, most: int
 ) -> Array:
     """Return goal states of all alternatives, the nearest valid ones if there are any, shape (G, n)."""
     plain = replace(scene, other_goal_poses=())
@@ -391,15 +399,15 @@ def _of_alternatives(
         replace(plain, goal_q=scene.goal_q[:0], goal_pose=pose)
         for pose in scene.other_goal_poses
     )
-    found = [_goals(problem, robot, each, index) for each in (plain, *poses)]
+    found = [_goals(problem, robot, each, index, most=most) for each in (plain, *poses)]
     states = np.concatenate(found)
     # nan stands for a goal pose without joint positions.
     known = states[~np.isnan(states).any(axis=1)]
     if robot.shape is None or not len(known):
-        return (known if len(known) else states)[:MAX_GOAL_STATES]
+        return (known if len(known) else states)[:most]
     valid = _valid_ends(problem, robot, scene, known)
     start = start_state(scene, robot)
-    return nearest_states(valid, start, robot) if len(valid) else known[:1]
+    return nearest_states(valid, start, robot, most=most) if len(valid) else known[:1]
 
 
 def _states_within(
@@ -415,7 +423,7 @@ def _states_within(
 
 
 def _states_of_pose(
-    problem: Problem, robot: Robot, scene: SceneProblem, index: int
+    problem: Problem, robot: Robot, scene: SceneProblem, index: int, *, most: int
 ) -> Array:
     """Return collision-free joint positions with the goal pose of a scene, shape (G, n), G > 0; nan without any."""
     pose = scene.goal_pose
@@ -429,7 +437,7 @@ def _states_of_pose(
     random = np.random.default_rng([index, POSE_SEEDS])
     start = start_state(scene, robot)
     goals, found = states_of_pose(
-        kinematics, states, conditions, pose, start=start, random=random
+        kinematics, states, conditions, pose, start=start, random=random, most=most
     )
     if not len(found):
         return np.full((1, robot.n), np.nan)
