@@ -196,13 +196,13 @@ def nearest(name: str, known: Iterable[str], *, similarity: float = 0.5) -> str:
     meant = "-".join(SYNONYMS.get(word, word) for word in name.split("-"))
     if meant != name and meant in names:
         return f" (did you mean {meant!r}?)"
-    completions = [
-        candidate for candidate in names if len(name) > 2 and candidate.startswith(name)
-    ]
+    # Words in capitals mean the same ones.
+    lower, word = {each.lower(): each for each in names}, name.lower()
+    completions = [each for each in lower if len(word) > 2 and each.startswith(word)]
     close = (
-        difflib.get_close_matches(name, names, n=1, cutoff=similarity) or completions
+        difflib.get_close_matches(word, lower, n=1, cutoff=similarity) or completions
     )
-    return f" (did you mean {close[0]!r}?)" if close else ""
+    return f" (did you mean {lower[close[0]]!r}?)" if close else ""
 
 
 def listed(names: Sequence[object], most: int = 20) -> str:

@@ -1,4 +1,4 @@
-"""Draw the pictures of the concept pages: python docs/pictures.py (extra `plot`).
+"""Draw the pictures of the concept pages and of a training: python docs/pictures.py (extra `plot`).
 
 Each picture shows computed data: plans of the refiner, control points of the boundary layer, obstacles of samples.
 """
@@ -9,13 +9,15 @@ from pathlib import Path
 import numpy as np
 from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
-from matplotlib.patches import Rectangle
+from matplotlib.patches import Circle, Rectangle
 from scipy.interpolate import BSpline
 
 import cnpgen
+from cnpgen.problems.constraints.puck_contact import PuckContact
 from cnpgen.problems.problem_record import open_problem, record_problem
 from cnpgen.robots.drive import NO_DRIVE
 from cnpgen.robots.robot import Robot
+from cnpgen.training.log import plot_curve
 from cnpgen.world.path import PathWorld
 
 FOLDER = Path(__file__).parent / "images"
@@ -216,10 +218,15 @@ def draw_scenes() -> None:
 
 def draw_certification() -> None:
     """Draw the paths of the tip of valid plans of certified samples, coloured by their speed."""
-    problems = cnpgen.draw_boundary_problems("airhockey-replan", 14, seed=3)
+    problems = cnpgen.draw_boundary_problems("airhockey-replan", 8, seed=3)
     refinement = cnpgen.solve_plans(problems, workers=1)
     assert refinement.valid.all()
     robot, s = cnpgen.RobotModel("airhockey"), np.linspace(0, 1, 80)
+    (contact,) = (
+        each
+        for each in cnpgen.load_problem("airhockey").constraint
+        if isinstance(each, PuckContact)
+    )
     states, times = refinement.plans.motion.at(s), refinement.plans.motion.time_at(s)
     drawn = figure(5.4, 4.2)
     axes = drawn.subplots(1, 1)
@@ -231,11 +238,13 @@ def draw_certification() -> None:
             array=speed,
             clim=(0, MAX_SPEED),
             cmap="viridis_r",
-            linewidths=1.8,
+            linewidths=2.5,
         )
         axes.add_collection(lines)
-        axes.plot(*xy[0], "o", color=GRAY, markersize=4)
-        axes.annotate("", xy[-1], xy[-4], arrowprops={"arrowstyle": "-|>", "lw": 0.8})
+        axes.plot(*xy[0], "o", color=GRAY, markersize=6)
+        along = (xy[-1] - xy[-2]) / np.linalg.norm(xy[-1] - xy[-2])
+        puck = xy[-1] + contact.contact_distance * along
+        axes.add_patch(Circle(tuple(puck), contact.puck_radius, color=RED, alpha=0.8))
     axes.add_patch(Rectangle((0.6, -0.45), 1.4, 0.9, fill=False, color=GRAY))
     axes.set(
         xlabel="x [m]", ylabel="y [m]", xlim=(0.55, 1.4), ylim=(-0.5, 0.5), aspect=1
@@ -293,6 +302,11 @@ def draw_drives() -> None:
     save(drawn, "drives")
 
 
+def draw_training() -> None:
+    """Draw the learning curve of a shipped planner from the log in its file."""
+    plot_curve(cnpgen.load_model("airhockey-hit").log, FOLDER / "training.png")
+
+
 def main() -> None:
     """Draw all pictures."""
     import matplotlib as mpl
@@ -305,6 +319,7 @@ def main() -> None:
     draw_scenes()
     draw_certification()
     draw_drives()
+    draw_training()
 
 
 if __name__ == "__main__":

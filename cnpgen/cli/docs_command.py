@@ -12,7 +12,7 @@ from contextlib import suppress
 from pathlib import Path, PurePosixPath
 from typing import Any
 
-from cnpgen.cli.parser import Parser, add_json
+from cnpgen.cli.parser import Parser, add_json, refuse
 from cnpgen.errors import CnpgenError, MachineError, UsageError, lacks
 from cnpgen.schema import addons
 
@@ -40,6 +40,7 @@ def run(arguments: argparse.Namespace) -> int:
     pages = list_pages()
     name = None if arguments.page is None else page_name(arguments.page, pages)
     if arguments.search is not None:
+        refuse(arguments, ["url"], "{} has no effect with --search")
         return _search(arguments.search, pages, as_json=arguments.json)
     if arguments.url:
         _print_url(pages[name] if name else pages["index"])

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from cnpgen.cli import recipe_names, values, verdict_text
-from cnpgen.cli.parser import EXTRAPOLATE, Parser, add_json
+from cnpgen.cli.parser import EXTRAPOLATE, Parser, add_json, refuse
 from cnpgen.cli.terminal import Meter
 from cnpgen.errors import DatasetError, UsageError
 
@@ -61,8 +61,8 @@ def add_options(parser: Parser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    if arguments.plan is not None and not arguments.plot:
-        raise UsageError("--plan needs --plot")
+    if not arguments.plot:
+        refuse(arguments, ["plan"], "{} needs --plot")
     found = _evaluate(arguments)
     if arguments.json:
         _write_json(arguments.file, found)

@@ -29,8 +29,8 @@ class _Help(argparse.RawDescriptionHelpFormatter):
         self._action_max_length = len("    make-dataset")
 
 
-class StoreOnce(argparse._StoreAction):
-    """Store the input that an option names, and refuse a second one, which would be lost."""
+class _StoreOnce(argparse._StoreAction):
+    """Store the value of an option, and refuse another one after it: one would be lost."""
 
     def __call__(
         self,
@@ -44,10 +44,11 @@ class StoreOnce(argparse._StoreAction):
         Raises:
             argparse.ArgumentError: The option has another value already.
         """
-        before = getattr(namespace, self.dest, self.default)
-        if option_string and before is not self.default and before != values:
+        assert isinstance(parser, Parser)
+        before = parser.given.setdefault(self.dest, values)
+        if option_string and before != values:
             raise argparse.ArgumentError(
-                self, f"names one input, got {before} and {values}"
+                self, f"given twice, {before} and {values}: expected once"
             )
         super().__call__(parser, namespace, values, option_string)
 
@@ -63,6 +64,10 @@ class Parser(argparse.ArgumentParser):
             **options,
         )
         self._negative_number_matcher = _NEGATIVE
+        # Groups of options share this registry: None is the action of most options.
+        self.register("action", None, _StoreOnce)
+        # Option -> its value.
+        self.given: dict[str, Any] = {}
 
     def error(self, message: str) -> NoReturn:
         """Raise UsageError with the error and the help command on one line."""
@@ -206,9 +211,32 @@ def options_of(arguments: argparse.Namespace, *names: str) -> dict[str, Any]:
 
 
 def refuse(arguments: argparse.Namespace, names: Sequence[str], why: str) -> None:
-    """Raise UsageError if one of some options was passed."""
-    if any(getattr(arguments, name) is not None for name in names):
-        raise UsageError(why)
+    """Raise UsageError if an option was passed that has no effect; ``{}`` stands for it in ``why``."""
+    for action in arguments.parser._actions:
+        name = action.dest
+        if name in names and getattr(arguments, name) != action.default:
+            # The long name, or that of a positional argument.
+            raise UsageError(
+                why.replace("{}", (*action.option_strings[-1:], action.metavar)[0])
+            )
+
+
+def refuse_others(arguments: argparse.Namespace, *names: str) -> None:
+    """Raise UsageError for all options but some, the first of which is without effect of others."""
+    known = {*names, "run", "parser", "json", "quiet", "verbose"}
+    others = [name for name in vars(arguments) if name not in known]
+    refuse(arguments, others, f"{{}} has no effect with --{names[0]}")
+
+
+def add_selection(parser: Options) -> None:
+    """Add the options that select samples of a folder, or the number and the seed of fresh ones."""
+    option, selected = parser.add_argument, "first sample of the split (default: 0)"
+    option("--split", metavar="NAME", help="split of the folder (default: validation)")
+    option("--first", metavar="I", type=values.natural, help=selected)
+    text = "number of problems; for a folder by default all that follow"
+    option("--n", metavar="K", type=values.rows, help=text)
+    text = "root seed of fresh problems; default the recipe's"
+    option("--seed", metavar="S", type=values.seed, help=text)
 
 
 def add_json(parser: Parser) -> None:

@@ -18,8 +18,16 @@ from hashlib import sha256
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from cnpgen.cli import recipe_names, values
-from cnpgen.cli.parser import ENGINE, Parser, add_engine, add_json, options_of, refuse
+from cnpgen.cli import recipe_names
+from cnpgen.cli.parser import (
+    ENGINE,
+    Parser,
+    add_engine,
+    add_json,
+    add_selection,
+    options_of,
+    refuse,
+)
 from cnpgen.cli.refine_command import (
     ALLOW_UNUSED,
     LARGE_ANGLES,
@@ -41,6 +49,9 @@ if TYPE_CHECKING:
     from cnpgen.planner.plan_requests import Requests
 
 
+_OF_FILES = "{} is for files of boundary conditions or scenes"
+
+
 def add_options(parser: Parser) -> None:
     option = parser.add_argument
     text = "a dataset's folder; a dataset or pipeline by name, or a recipe file; boundary conditions in HDF5; or scenes"
@@ -49,25 +60,7 @@ def add_options(parser: Parser) -> None:
     option("--model", metavar="NAME|FILE", type=recipe_names.model, help=text)
     text = "plan file to write, .h5 (default for a recipe: NAME-plans.h5)"
     option("-o", "--out", metavar="PLANS", type=Path, help=text)
-    option("--split", metavar="NAME", help="split of the dataset (default: validation)")
-    option(
-        "--first",
-        metavar="I",
-        type=values.natural,
-        help="first sample of the split (default: 0)",
-    )
-    option(
-        "--n",
-        metavar="K",
-        type=values.rows,
-        help="number of problems; for a folder by default all that follow",
-    )
-    option(
-        "--seed",
-        metavar="S",
-        type=values.seed,
-        help="root seed of fresh problems; default the recipe's",
-    )
+    add_selection(parser)
     option(
         "--other-rows",
         action="store_true",
@@ -94,26 +87,18 @@ def run(arguments: argparse.Namespace) -> int:
     import json
     import time
 
-    from cnpgen.cli.finished import content_sha256, is_finished, record_request
-    from cnpgen.planner.model_file import find_model, load_model
+    from cnpgen.cli.finished import is_finished, record_request
+    from cnpgen.planner.model_file import load_model
     from cnpgen.planner.planner import Planner
     from cnpgen.plans import save_plans
 
     _complete(arguments)
     model = load_model(arguments.model)
     requests = _requests(arguments, model)
-    # What the result depends on: model, boundary conditions, further columns, options.
-    request = [
-        content_sha256(find_model(arguments.model)),
-        _checksums(requests.boundary.arrays()),
-        _checksums({**requests.columns, "sample_id": requests.sample_id}),
-        options_of(arguments, "no_time_scaling", "allow_large_angles"),
-    ]
+    request, out = _request(arguments, requests), arguments.out
     # With --refine, ``refine_and_save`` compares its own request.
-    if not arguments.refine and is_finished(
-        arguments.out, request, force=arguments.force
-    ):
-        return report_finished(arguments, arguments.out)
+    if not arguments.refine and is_finished(out, request, force=arguments.force):
+        return report_finished(arguments, out)
     planner = Planner(model, scale_time=not arguments.no_time_scaling)
     begun = time.perf_counter()
     plans = planner.plan_batch(
@@ -123,30 +108,35 @@ def run(arguments: argparse.Namespace) -> int:
         allow_large_angles=arguments.allow_large_angles,
     )
     seconds = time.perf_counter() - begun
-    if not arguments.quiet:
-        text = f"{counted(len(plans), 'plan')} in {1e3 * seconds:.1f} ms"
-        if len(plans):
-            text += f", {1e6 * seconds / len(plans):.0f} us each, mean motion time {plans.duration.mean():.3f} s"
-        print(text, file=sys.stderr)
-    if arguments.refine:
-        return refine_and_save(
-            arguments,
-            plans,
-            arguments.out,
-            title=f"refining plans of {arguments.model}",
-        )
-    save_plans(arguments.out, plans)
-    record_request(arguments.out, request)
     # No plans have no mean, which is null in JSON.
     duration = float(plans.duration.mean()) if len(plans) else None
-    facts = {
-        "file": str(arguments.out),
-        "plans": len(plans),
-        "seconds": seconds,
-        "mean_duration_s": duration,
-    }
-    print(json.dumps(facts, indent=2) if arguments.json else arguments.out)
+    if not arguments.quiet:
+        text = f"{counted(len(plans), 'plan')} in {1e3 * seconds:.1f} ms"
+        if duration is not None:
+            text += f", {1e6 * seconds / len(plans):.0f} us each, mean motion time {duration:.3f} s"
+        print(text, file=sys.stderr)
+    if arguments.refine:
+        title = f"refining plans of {arguments.model}"
+        return refine_and_save(arguments, plans, out, title=title)
+    save_plans(out, plans)
+    record_request(out, request)
+    facts = {"file": str(out), "plans": len(plans), "seconds": seconds}
+    facts |= {"mean_duration_s": duration}
+    print(json.dumps(facts, indent=2) if arguments.json else out)
     return 0
+
+
+def _request(arguments: argparse.Namespace, requests: "Requests") -> list[Any]:
+    """Return what the result depends on: model, boundary conditions, further columns, options."""
+    from cnpgen.cli.finished import content_sha256
+    from cnpgen.planner.model_file import find_model
+
+    return [
+        content_sha256(find_model(arguments.model)),
+        _checksums(requests.boundary.arrays()),
+        _checksums({**requests.columns, "sample_id": requests.sample_id}),
+        options_of(arguments, "no_time_scaling", "allow_large_angles"),
+    ]
 
 
 def _checksums(arrays: "Mapping[str, NDArray[Any]]") -> dict[str, str]:
@@ -173,14 +163,8 @@ def _complete(arguments: argparse.Namespace) -> None:
             raise UsageError(
                 f"the following arguments are required: {option}; see 'cnpgen plan --help'"
             )
-    refining = options_of(arguments, *ENGINE, "explain", *REFINING)
-    lost = [
-        name
-        for name, value in refining.items()
-        if value != arguments.parser.get_default(name)
-    ]
-    if lost and not arguments.refine:
-        raise UsageError(f"--{lost[0].replace('_', '-')} needs --refine")
+    if not arguments.refine:
+        refuse(arguments, (*ENGINE, "explain", *REFINING), "{} needs --refine")
     check_free(arguments.out, force=arguments.force, unless_finished=True)
 
 
@@ -198,7 +182,9 @@ def _requests(arguments: argparse.Namespace, model: "Model") -> "Requests":
     problems = Path(arguments.problems)
     if problems.exists() and holds_scenes(problems):
         return _scenes(arguments, model)
+    refuse(arguments, ["allow_unused"], f"{{}} is for scenes, got {problems}")
     if problems.is_dir():
+        refuse(arguments, ["allow_large_angles"], _OF_FILES)
         return read_rows(
             problems,
             model,
@@ -209,8 +195,8 @@ def _requests(arguments: argparse.Namespace, model: "Model") -> "Requests":
         )
     refuse(
         arguments,
-        ["split", "first", "n", "allow_unused"],
-        "--split, --first and --n need the folder of a dataset, --allow-unused needs scenes, got a file",
+        ["split", "first", "n"],
+        "{} needs the folder of a dataset, got a file",
     )
     return read_file(
         problems,
@@ -225,10 +211,11 @@ def _scenes(arguments: argparse.Namespace, model: "Model") -> "Requests":
     from cnpgen.planner.plan_requests import scene_requests
     from cnpgen.problems.scenes.scene_reader import ReadingOptions, read_scenes
 
-    if arguments.split is not None or arguments.other_rows:
-        raise UsageError(
-            "--split and --other-rows are for datasets; scenes have --first and --n"
-        )
+    refuse(
+        arguments,
+        ["split", "other_rows"],
+        "{} is for datasets; scenes have --first and --n",
+    )
     return scene_requests(
         model,
         read_scenes(
@@ -255,8 +242,12 @@ def _draws(arguments: argparse.Namespace, model: "Model") -> "Requests":
     from cnpgen.store.files.documents import plain
 
     name = arguments.problems
-    of_rows = "--split and --first need the folder of a dataset; samples drawn from a recipe have --seed"
+    of_rows = (
+        "{} needs the folder of a dataset; samples drawn from a recipe have --seed"
+    )
     refuse(arguments, ["split", "first"], of_rows)
+    refuse(arguments, ["allow_unused"], "{} is for scenes, got a recipe")
+    refuse(arguments, ["allow_large_angles"], _OF_FILES)
     if arguments.n is None:
         raise UsageError(
             f"--n is required: the number of fresh problems of the recipe {name}"

@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from cnpgen.cli import recipe_names, values
-from cnpgen.cli.parser import EXTRAPOLATE, Parser, StoreOnce, options_of, refuse
+from cnpgen.cli.parser import EXTRAPOLATE, Parser, add_selection, options_of, refuse
 from cnpgen.cli.refine_command import (
     ALLOW_UNUSED,
     LARGE_ANGLES,
@@ -29,9 +29,14 @@ from cnpgen.cli.refine_command import (
 )
 from cnpgen.errors import DatasetError, UsageError, listed
 
+STAY_WITHIN = "{} needs the path of a plan: 'cnpgen refine', a dataset made with --certify, or --initial-plans"
+
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     from cnpgen.make.solve_scenes import SolvedScenes
     from cnpgen.plans import Plans
+    from cnpgen.problems.scenes.scene_problem import SceneProblem
 
 
 def add_options(parser: Parser) -> None:
@@ -39,46 +44,12 @@ def add_options(parser: Parser) -> None:
     text = "a dataset's folder; a dataset or pipeline by name, or a recipe file; boundary conditions in HDF5;"
     text += " or, with --robot, scenes"
     option("what", metavar="DIR|NAME|FILE", type=recipe_names.problems, help=text)
-    option(
-        "--n",
-        metavar="K",
-        type=values.rows,
-        help="number of problems; for a folder all of the split by default",
-    )
-    option("--split", metavar="NAME", help="split of the folder (default: validation)")
-    option(
-        "--first",
-        metavar="I",
-        type=values.natural,
-        help="first sample of the split (default: 0)",
-    )
-    option(
-        "--seed",
-        metavar="S",
-        type=values.seed,
-        help="root seed of fresh problems; default the recipe's",
-    )
+    add_selection(parser)
     text = "the problem of boundary conditions in HDF5; its tolerances are used"
     option("--problem", metavar="NAME|FILE", type=recipe_names.problem, help=text)
     text = f"{EXTRAPOLATE}, in HDF5"
     option("--extrapolate", action="store_true", default=None, help=text)
-    text = "solve scenes with this problem of a robot, such as panda"
-    option("--robot", metavar="NAME|FILE", type=recipe_names.problem, help=text)
-    option("--allow-unused", metavar="KEY", action="append", help=ALLOW_UNUSED)
-    text = "mass of objects that scenes attach with weight 0, such as 2kg"
-    option("--payload", metavar="KG", type=values.kilograms, help=text)
-    text = (
-        "present positions of the planned joints, for scenes whose start state is empty"
-    )
-    option("--start", metavar="Q1,Q2,...", type=values.positions, help=text)
-    text = "plan file with a plan for each scene, before obstacles or ends moved a little: initial guesses"
-    option("--initial-plans", metavar="FILE", type=Path, action=StoreOnce, help=text)
-    text = (
-        "end motions in scenes with zero acceleration, so that another one may follow"
-    )
-    option("--smooth-stop", action="store_true", default=None, help=text)
-    text = "folder with the packages of mesh files of scenes; may be repeated"
-    option("--packages", metavar="FOLDER", type=Path, action="append", help=text)
+    _add_scenes(parser)
     option(
         "-o",
         "--out",
@@ -91,6 +62,28 @@ def add_options(parser: Parser) -> None:
     option("--allow-large-angles", action="store_true", help=LARGE_ANGLES)
     parser.epilog = f"{parser.epilog or ''}\n"
     add_refine_options(parser)
+
+
+def _add_scenes(parser: Parser) -> None:
+    """Add the options of scenes."""
+    option = parser.add_argument
+    text = "solve scenes with this problem of a robot, such as panda"
+    option("--robot", metavar="NAME|FILE", type=recipe_names.problem, help=text)
+    option("--allow-unused", metavar="KEY", action="append", help=ALLOW_UNUSED)
+    text = "mass of objects that scenes attach with weight 0, such as 2kg"
+    option("--payload", metavar="KG", type=values.kilograms, help=text)
+    text = (
+        "present positions of the planned joints, for scenes whose start state is empty"
+    )
+    option("--start", metavar="Q1,Q2,...", type=values.positions, help=text)
+    text = "plan file with a plan for each scene, before obstacles or ends moved a little: initial guesses"
+    option("--initial-plans", metavar="FILE", type=Path, help=text)
+    text = (
+        "end motions in scenes with zero acceleration, so that another one may follow"
+    )
+    option("--smooth-stop", action="store_true", default=None, help=text)
+    text = "folder with the packages of mesh files of scenes; may be repeated"
+    option("--packages", metavar="FOLDER", type=Path, action="append", help=text)
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -106,6 +99,8 @@ def run(arguments: argparse.Namespace) -> int:
     problems = _problems(arguments)
     # Rows of certified datasets have plans.
     make = refine_plans if math.isfinite(problems.duration[0]) else solve_plans
+    if make is solve_plans:
+        refuse(arguments, ["stay_within"], STAY_WITHIN)
     return refine_and_save(
         arguments, problems, out, title=f"solving {arguments.what}", make=make
     )
@@ -116,29 +111,16 @@ def _solve_scenes(arguments: argparse.Namespace, out: Path) -> int:
 
     from cnpgen.make.solve_scenes import SceneOptions, solve_scenes
     from cnpgen.problems.problem_record import as_problem, record_problem
-    from cnpgen.problems.scenes.scene_reader import ReadingOptions, read_scenes
 
     refuse(
         arguments,
-        ["split", "seed", "problem", "extrapolate"],
-        "--split, --seed, --problem and --extrapolate are not for scenes (--robot), which have --first and --n",
+        ["split", "seed", "problem", "extrapolate", "allow_large_angles"],
+        "{} is not for scenes (--robot), which have --first and --n",
     )
+    if arguments.initial_plans is None:
+        refuse(arguments, ["stay_within"], STAY_WITHIN)
     problem = as_problem(arguments.robot)
-    joints, positions = problem.robot.joints, arguments.start or ()
-    if positions and len(positions) != len(joints):
-        raise UsageError(
-            f"--start must have {len(joints)} positions of {listed(joints)}, got {len(positions)}"
-        )
-    scenes = read_scenes(
-        Path(arguments.what),
-        start=arguments.first or 0,
-        n=arguments.n,
-        options=ReadingOptions(
-            arguments.allow_unused or (),
-            arguments.packages or (),
-            dict(zip(joints, positions, strict=False)),
-        ),
-    )
+    scenes = _scenes(arguments, problem.robot.joints)
     record, initial = record_problem(problem), None
     if arguments.initial_plans is not None:
         initial = recipe_names.read_plans(arguments.initial_plans, problem=None)
@@ -164,13 +146,30 @@ def _solve_scenes(arguments: argparse.Namespace, out: Path) -> int:
         )
         return solve_scenes(problem, scenes, run=run, **options)
 
+    title = f"solving {arguments.what}"
     return refine_and_save(
-        arguments,
-        None,
-        out,
-        title=f"solving {arguments.what}",
-        make=solve,
-        request=request,
+        arguments, None, out, title=title, make=solve, request=request
+    )
+
+
+def _scenes(
+    arguments: argparse.Namespace, joints: "Sequence[str]"
+) -> "list[SceneProblem]":
+    """Read the scenes; the start positions of the planned joints are those of --start."""
+    from cnpgen.problems.scenes.scene_reader import ReadingOptions, read_scenes
+
+    positions = arguments.start or ()
+    if positions and len(positions) != len(joints):
+        raise UsageError(
+            f"--start must have {len(joints)} positions of {listed(joints)}, got {len(positions)}"
+        )
+    start = dict(zip(joints, positions, strict=False))
+    unused, packages = arguments.allow_unused or (), arguments.packages or ()
+    return read_scenes(
+        Path(arguments.what),
+        start=arguments.first or 0,
+        n=arguments.n,
+        options=ReadingOptions(unused, packages, start),
     )
 
 
@@ -189,8 +188,7 @@ def _problems(arguments: argparse.Namespace) -> "Plans":
             "initial_plans",
             "smooth_stop",
         ],
-        "--allow-unused, --payload, --start, --packages, --initial-plans and --smooth-stop are for scenes,"
-        " which need --robot",
+        "{} is for scenes, which need --robot",
     )
     what = Path(arguments.what)
     kind = file_kind(what)
@@ -219,8 +217,8 @@ def _rows(arguments: argparse.Namespace) -> "Plans":
     )
     refuse(
         arguments,
-        ["problem", "extrapolate"],
-        "--problem and --extrapolate are for boundary conditions in HDF5; a dataset contains its problem",
+        ["problem", "extrapolate", "allow_large_angles"],
+        "{} is for boundary conditions in HDF5; a dataset contains its problem",
     )
     split = arguments.split or "validation"
     return load_boundary_problems(
@@ -234,7 +232,7 @@ def _conditions(arguments: argparse.Namespace) -> "Plans":
     refuse(
         arguments,
         ["split", "first", "n"],
-        "--split, --first and --n need the folder of a dataset, got a file",
+        "{} needs the folder of a dataset, got a file",
     )
     refuse(
         arguments,
@@ -258,12 +256,14 @@ def _draws(arguments: argparse.Namespace) -> "Plans":
 
     recipe_names.check_recipe(arguments.what)
     recipe = load_dataset_recipe(arguments.what)
-    of_rows = "--split and --first need the folder of a dataset; samples drawn from a recipe have --seed"
+    of_rows = (
+        "{} needs the folder of a dataset; samples drawn from a recipe have --seed"
+    )
     refuse(arguments, ["split", "first"], of_rows)
     refuse(
         arguments,
-        ["problem", "extrapolate"],
-        "--problem and --extrapolate are for boundary conditions in HDF5; a recipe contains its problem",
+        ["problem", "extrapolate", "allow_large_angles"],
+        "{} is for boundary conditions in HDF5; a recipe contains its problem",
     )
     if arguments.n is None:
         raise UsageError(

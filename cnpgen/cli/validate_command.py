@@ -20,7 +20,7 @@ import argparse
 from pathlib import Path
 
 from cnpgen.cli import recipe_names, values
-from cnpgen.cli.parser import ENGINE, Parser, add_engine, add_json, options_of
+from cnpgen.cli.parser import ENGINE, Parser, add_engine, add_json, options_of, refuse
 from cnpgen.cli.terminal import Meter
 from cnpgen.errors import DatasetError
 
@@ -45,6 +45,8 @@ def run(arguments: argparse.Namespace) -> int:
     from cnpgen.store.files.documents import plain, render
     from cnpgen.validate.validate_dataset import validate_dataset
 
+    if not arguments.deep:
+        refuse(arguments, ENGINE, "{} needs --deep")
     options = options_of(arguments, "deep", "regenerate", *ENGINE)
     with Meter(quiet=arguments.quiet) as meter:
         # Only --deep reads samples, which the bar counts.

@@ -107,7 +107,8 @@ def load_plans(
     try:
         plans = _assembled(path, record, columns, attributes)
     except UsageError as error:
-        raise DatasetError(f"{path}: {error}") from error
+        text = f"{path}: {error.args[0]}"
+        raise DatasetError(text, remedies=error.remedies) from error
     return correct_tips(replace(plans, has_checksum=has_checksum), where=f"{path}: ")
 
 
@@ -373,12 +374,15 @@ def save_plans(path: str | Path, plans: Plans) -> None:
         plans: Plans to write.
 
     Raises:
-        UsageError: The path holds another file, or ``plans`` has another type.
+        UsageError: The path holds another file, or ``plans`` has another type, or a
+            parameter outside of its range.
         MachineError: The disk is full or read-only, or a file operation failed.
     """
     import h5py
 
     check_replaceable(Path(path))
+    # Arrays may have changed since they were checked.
+    plans = replace(plans)
     buffer = io.BytesIO()
     fields = plan_fields(plans.problem.joint_names, plans.problem.prismatic_joints)
     with h5py.File(create_hdf5(buffer, userblock=HEADER_BYTES)) as file:

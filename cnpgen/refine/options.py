@@ -55,6 +55,9 @@ class RefineOptions:
             raise UsageError(
                 f"must not be negative, got {self.weight}", argument="weight"
             )
+        if self.weight is not None and "=" in self.objective:
+            text = f"must be None: the objective {self.objective!r} has weights"
+            raise UsageError(text, argument="weight")
         integer("max_iterations", self.max_iterations, least=0)
         if not 0 < number("tolerance", self.tolerance) < 1:
             raise UsageError(

@@ -22,6 +22,8 @@ PAYLOAD_CENTRE = ("payload_x", "payload_y", "payload_z")
 PAYLOAD_PARAMETERS = ("payload_mass", *PAYLOAD_CENTRE, "payload_inertia")
 MAX_TILT_RAD = 0.5  # of a table or an upright direction about each axis
 RANGE_ROUNDING = 1e-12  # of values at the ends of a range
+# Argument of the readers of files and tasks.
+EXTRAPOLATE: Mapping[str, object] = {"extrapolate": True}
 
 
 def optional_key(doc: str, unit: str = "1", default: Any = None, **bounds: Any) -> Any:
@@ -180,14 +182,14 @@ class ParameterRanges:
         # Comparisons with nan are false, so that nan would pass; infinity is out of all
         # ranges.
         if text := self.out_of_range(np.nan_to_num(rows, nan=np.inf), shown=rows):
-            raise UsageError(text, argument="parameters")
+            raise UsageError(text, concerns="parameters", remedies=EXTRAPOLATE)
         return rows
 
     def out_of_range(self, rows: Array, *, shown: Array | None = None) -> str:
         """Return an error text if a value of shape (N, width) is outside of its range, otherwise "".
 
         Values that are not numbers pass: the verdict reports them. The text shows
-        values of ``shown``, by default the same.
+        values of ``shown``, by default the same, and takes the remedies ``EXTRAPOLATE``.
         """
         for column, (name, span) in enumerate(
             zip(self.names, self.ranges, strict=True)
@@ -200,7 +202,8 @@ class ParameterRanges:
                 row = int(outside.argmax())
                 value = (rows if shown is None else shown)[row, column]
                 low, high, got = distinct(span.low, span.high, value)
-                return f"{name} must be from {low} to {high}, got {got} in row {row}"
+                text = f"{name} must be from {low} to {high}, got {got} in row {row}"
+                return f"{text}; {{extrapolate}} allows values outside"
         return ""
 
     def widened(self, rows: Array) -> ParameterRanges:

@@ -83,6 +83,10 @@ class RobotSpec:
         "links whose collision meshes are left out, so that nothing checks them",
         default=(),
     )
+    allow_unused: tuple[str, ...] = optional_key(
+        "names of elements and attributes of URDF and SRDF that resemble known names, and are not read",
+        default=(),
+    )
     ignored_pairs: tuple[tuple[str, str], ...] = optional_key(
         "pairs of links whose collisions are not checked, besides those of the SRDF",
         default=(),

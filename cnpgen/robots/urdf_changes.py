@@ -1,7 +1,7 @@
 """Changes of the text of a URDF: locked joints, disabled pairs of links, and the payload as a link."""
 
 import logging
-from collections.abc import Iterable, Mapping
+from collections.abc import Collection, Iterable, Mapping
 from pathlib import Path
 from xml.etree import ElementTree
 from xml.etree.ElementTree import Element
@@ -22,7 +22,7 @@ _TAG, _PAIR = "disable_collisions", ("link1", "link2")
 _NO_DEFAULT = "disable_default_collisions"
 # The problem names the planned joints, the tip and the placement of the base; pairs are
 # checked unless they are disabled, which takes precedence over <enable_collisions>.
-_SRDF = {
+SRDF_NAMES = {
     "robot": (
         *("name", "version", _TAG, _NO_DEFAULT, "group", "group_state"),
         *("end_effector", "virtual_joint", "passive_joint", "joint_property"),
@@ -205,8 +205,10 @@ def _turn(axis: np.ndarray, angle: float) -> np.ndarray:
     )
 
 
-def with_disabled_pairs(urdf: str, srdf: Path) -> str:
-    """Return a URDF with the disabled link pairs of an SRDF file.
+def with_disabled_pairs(
+    urdf: str, srdf: Path, *, allow_unused: Collection[str] = ()
+) -> str:
+    """Return a URDF with the disabled link pairs of an SRDF file, in which some names may be left unused.
 
     URDF parsers ignore unknown elements. Pairs with links that the URDF lacks, such as
     those of another gripper, are left out with a warning that lists the links.
@@ -219,7 +221,7 @@ def with_disabled_pairs(urdf: str, srdf: Path) -> str:
         raise RecipeError(
             [f"{srdf}: is a URDF, expected an SRDF with <{_TAG}> elements"]
         )
-    _account_srdf(tree, srdf)
+    _account_srdf(tree, srdf, allow_unused)
     entries = [dict(entry.attrib) for entry in tree.iter(_TAG)]
     links = {link.get("name", "") for link in urdf_tree(urdf).iter("link")}
     named = {entry[key] for entry in entries for key in _PAIR if key in entry}
@@ -236,9 +238,9 @@ def with_disabled_pairs(urdf: str, srdf: Path) -> str:
     return _with_entries(urdf, known, str(srdf))
 
 
-def _account_srdf(tree: Element, srdf: Path) -> None:
+def _account_srdf(tree: Element, srdf: Path, allow_unused: Collection[str]) -> None:
     """Raise RecipeError for elements of an SRDF that are not honoured or unknown, and list those that are not used."""
-    check_elements(tree, srdf, _SRDF)
+    check_elements(tree, srdf, SRDF_NAMES, allow_unused=allow_unused)
     if tree.find(_NO_DEFAULT) is not None:
         text = f"its link would collide with no obstacle: give pairs by <{_TAG}>"
         raise RecipeError([f"{srdf}: <{_NO_DEFAULT}> is not supported: {text}"])
@@ -334,29 +336,18 @@ def _elements(
         )
     for name in payload.touch_links:
         if name not in links:
-            raise RecipeError(
-                [
-                    f"payload.touch_links: the URDF has no link {name!r}{nearest(name, links)}"
-                ]
-            )
-    link, joint = (
-        ElementTree.Element("link", name=PAYLOAD),
-        ElementTree.Element("joint", name=PAYLOAD, type="fixed"),
-    )
+            text = f"the URDF has no link {name!r}{nearest(name, links)}"
+            raise RecipeError([f"payload.touch_links: {text}"])
+    link = ElementTree.Element("link", name=PAYLOAD)
     for kind in ("visual", "collision"):
-        geometry = ElementTree.SubElement(
-            ElementTree.SubElement(link, kind), "geometry"
-        )
+        element = ElementTree.SubElement(link, kind)
+        geometry = ElementTree.SubElement(element, "geometry")
         ElementTree.SubElement(geometry, "box", size=numbers_text(payload.size or ()))
+    joint = ElementTree.Element("joint", name=PAYLOAD, type="fixed")
     ElementTree.SubElement(joint, "parent", link=parent)
     ElementTree.SubElement(joint, "child", link=PAYLOAD)
-    center = np.array(spec.tip_offset) + turned(*spec.tip_rotation) @ np.array(
-        payload.centre
-    )
-    ElementTree.SubElement(
-        joint,
-        "origin",
-        xyz=numbers_text(center.tolist()),
-        rpy=numbers_text(spec.tip_rotation),
-    )
+    offset = turned(*spec.tip_rotation) @ np.array(payload.centre)
+    xyz = numbers_text((np.array(spec.tip_offset) + offset).tolist())
+    rpy = numbers_text(spec.tip_rotation)
+    ElementTree.SubElement(joint, "origin", xyz=xyz, rpy=rpy)
     return link, joint

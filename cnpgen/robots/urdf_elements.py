@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from pathlib import Path
 from xml.etree.ElementTree import Element
 
@@ -59,16 +59,32 @@ def unread_elements(tree: Element) -> Iterator[str]:
 
 
 def check_elements(
-    tree: Element, path: Path, known: Mapping[str, tuple[str, ...]] = _KNOWN
+    tree: Element,
+    path: Path,
+    known: Mapping[str, tuple[str, ...]] = _KNOWN,
+    *,
+    allow_unused: Collection[str] = (),
 ) -> None:
-    """Raise RecipeError for parts of a file whose names are near one that is read, may occur beside them, and does not."""
+    """Raise RecipeError for parts of a file whose names are near one that is read, may occur beside them, and does not.
+
+    The caller accepts the loss of parts with some names.
+    """
     hints = {
-        text: nearest(name.lower(), names, similarity=MISSPELT)
+        text: nearest(name, names, similarity=MISSPELT)
         for text, name, names in _unknown(tree, known)
+        if name not in allow_unused
     }
     if parts := [f"{text}{hint}" for text, hint in hints.items() if hint]:
         named = listed(parts, MAX_LISTED_TAGS)
-        raise RecipeError([f"{path}: {named} would not be read: rename or remove it"])
+        remedy = "rename or remove it, or accept its loss by allow_unused in [robot] (--allow-unused of 'cnpgen init')"
+        raise RecipeError([f"{path}: {named} would not be read: {remedy}"])
+
+
+def unknown_names(
+    tree: Element, known: Mapping[str, tuple[str, ...]] = _KNOWN
+) -> list[str]:
+    """Return the names of the elements and attributes that are not read."""
+    return [name for _, name, _ in _unknown(tree, known)]
 
 
 def _unknown(

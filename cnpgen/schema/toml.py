@@ -10,7 +10,10 @@ from cnpgen.schema.texts import read_at_most, utf8_text
 Kind = Literal["problem", "pipeline", "dataset", "suite"]
 
 MARKS: dict[Kind, set[str]] = {
-    "problem": {"robot", "constraint", "limits"},
+    "problem": {
+        *("robot", "constraint", "limits", "drive", "object", "objective", "obstacle"),
+        *("parameters", "payload", "trajectory"),
+    },
     "pipeline": {"stage", "problem"},
     "dataset": {"splits", "pipeline"},
     "suite": {"pucks", "replanning", "samples"},

@@ -30,7 +30,8 @@ from cnpgen.store.shard import (
     storage_dtype,
 )
 
-SAMPLE_ID = "sample_id"
+SAMPLE_ID, PARAMETERS = "sample_id", "parameters"
+RANGE_ROUNDING = 1e-6  # relative
 
 
 @dataclass(frozen=True, eq=False)
@@ -184,8 +185,9 @@ def read_columns(
 
 
 def check_values(shard: Shard, columns: Mapping[str, NDArray[Any]]) -> None:
-    """Raise DatasetError if a value is not finite, or if sample IDs are not the indices of the rows."""
-    if problem := finite_problem(columns):
+    """Raise DatasetError for values that are not finite, parameters out of range, and wrong sample IDs."""
+    problem = finite_problem(columns) or _range_problem(shard.spec, columns)
+    if problem:
         raise DatasetError(f"{shard.path}: {problem}")
     ids = columns.get(SAMPLE_ID)
     if ids is not None and not np.array_equal(
@@ -194,3 +196,21 @@ def check_values(shard: Shard, columns: Mapping[str, NDArray[Any]]) -> None:
         raise DatasetError(
             f"{shard.path}: sample_id is not the index of the row in the split"
         )
+
+
+def _range_problem(spec: DatasetSpec, columns: Mapping[str, NDArray[Any]]) -> str:
+    """Describe the first parameter of the problem with a value outside of its range; empty if there is none."""
+    fields = {field.name: field for field in spec.fields if field.valid_max}
+    if PARAMETERS not in columns.keys() & fields.keys():
+        return ""
+    rows, field = columns[PARAMETERS], fields[PARAMETERS]
+    low, high = np.array(field.valid_min), np.array(field.valid_max)
+    # Ends of a range may be rounded to float32.
+    slack = RANGE_ROUNDING * np.maximum(np.abs(low), np.abs(high))
+    outside = (rows < low - slack) | (rows > high + slack)
+    if not outside.any():
+        return ""
+    row, column = np.argwhere(outside)[0]
+    name = field.names[column] if field.names else PARAMETERS
+    expected = f"from {low[column]:g} to {high[column]:g}"
+    return f"{name} must be {expected}, got {rows[row, column]:g} in row {row}"

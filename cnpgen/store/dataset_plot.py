@@ -1,4 +1,4 @@
-"""Figures of a dataset: histograms of joint fields, motions seen from above, and acceptance rates on the table."""
+"""Figures of a dataset: distributions of joint fields, motions seen from above, and acceptance rates on the table."""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -39,14 +39,14 @@ def plot_dataset(inspection: Inspection, path: str | Path) -> None:
             f"{inspection.folder} has no rows yet: there is nothing to plot"
         )
     joints = _joint_fields(inspection)
-    heights = [1.3 * len(joints) + 0.3, 4.2]
-    figure = new_figure(14, sum(heights) + 0.5)
+    heights = [0.35 * max((len(field.names) for field in joints), default=0) + 1, 4.2]
+    figure = new_figure(11, sum(heights) + 0.5)
     spec = inspection.spec
     figure.suptitle(
         f"{spec.name} {spec.version}, {counted(sum(inspection.rows.values()), 'row')} ({inspection.state})"
     )
     parts = figure.subfigures(2, 1, height_ratios=heights, squeeze=False)
-    _draw_histograms(parts[0, 0], joints, inspection.statistics)
+    _draw_joints(parts[0, 0], joints, inspection.statistics)
     _draw_task_space(parts[1, 0], inspection)
     save_figure(figure, Path(path))
 
@@ -64,33 +64,38 @@ def _joint_fields(inspection: Inspection) -> list[Field]:
     ]
 
 
-def _draw_histograms(
+def _draw_joints(
     figure: "SubFigure", fields: list[Field], statistics: Mapping[str, FieldStatistics]
 ) -> None:
-    """Draw one row of histograms per field and one column per joint, between the planning limits."""
+    """Draw one panel per unit: a line per joint, with the starts above it and the goals below it."""
     if not fields:
         return
-    axes = figure.subplots(len(fields), len(fields[0].names), squeeze=False)
-    for line, field in zip(axes, fields, strict=True):
-        for column, axis in enumerate(line):
-            _draw_histogram(axis, statistics[field.name], column)
-        line[0].set_ylabel(f"{field.name}\n[{field.unit}]", fontsize=8)
-    for axis, name in zip(axes[0], fields[0].names, strict=True):
-        axis.set_title(name, fontsize=9)
+    units = list(dict.fromkeys(field.unit for field in fields))
+    axes = figure.subplots(1, len(units), sharey=True, squeeze=False)[0]
+    for axis, unit in zip(axes, units, strict=True):
+        drawn = [field for field in fields if field.unit == unit]
+        for field in drawn:
+            _draw_distribution(axis, field, statistics[field.name])
+        axis.set_title(
+            f"{', '.join(field.name for field in drawn)} [{unit}]", fontsize=9
+        )
+        axis.set_xticks([-1, 1], ["lower limit", "upper limit"])
+        axis.tick_params(labelsize=8)
+    axes[0].set_yticks(range(len(fields[0].names)), fields[0].names)
+    axes[0].invert_yaxis()
 
 
-def _draw_histogram(axis: "Axes", statistics: FieldStatistics, column: int) -> None:
+def _draw_distribution(axis: "Axes", field: Field, statistics: FieldStatistics) -> None:
+    """Draw the histogram of every joint between its limits, over or under the joint's line."""
     assert statistics.histogram is not None
-    assert statistics.low is not None
-    assert statistics.high is not None
-    counts = statistics.histogram[column]
-    edges = np.linspace(
-        statistics.low[column], statistics.high[column], len(counts) + 1
-    )
-    axis.stairs(counts, edges, fill=True, color="tab:gray")
-    axis.set_xlim(*_widened(edges[0], edges[-1]))
-    axis.set_yticks([])
-    axis.tick_params(labelsize=6)
+    end = field.name.partition("_")[0]
+    side = 0.45 if end == "goal" else -0.45  # of the distance between two lines
+    edges = np.linspace(-1, 1, statistics.histogram.shape[1] + 1)
+    for joint, counts in enumerate(statistics.histogram):
+        profile = joint + side * counts / max(counts.max(), 1)
+        color = _COLORS.get(end, "tab:gray")
+        axis.stairs(profile, edges, baseline=joint, fill=True, color=color)
+        axis.axhline(joint, color="0.8", linewidth=0.5)
 
 
 def _draw_task_space(figure: "SubFigure", inspection: Inspection) -> None:

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 FIRST_LINE_KEYS = {"step", "epoch", "learning_rate", "seconds", "lost"}
-MIN_DRAWN_TERM = 1e-12  # smaller terms are drawn here
+MIN_DRAWN_RATIO = 1e-6  # smaller violations over their budgets are drawn here
 
 
 class TrainingLog:
@@ -61,50 +61,32 @@ def plot_curve(log: str, path: str | Path) -> None:
     steps = [record for record in records if "loss" in record]
     if not steps:
         raise UsageError("the log contains no step: nothing to draw")
-    figure = new_figure(12, 7)
-    axes = figure.subplots(2, 2, sharex=True).ravel()
-    _draw_loss(axes[0], steps)
-    _draw_terms(axes[1], steps)
     checks = [record for record in records if "validation" in record]
-    _draw_validity(axes[2], checks)
+    figure = new_figure(12, 3.6)
+    axes = figure.subplots(1, 3)
+    _draw_validity(axes[0], checks)
     durations = [record["validation"]["duration_s"] for record in checks]
-    axes[3].plot(_column(checks, "seconds"), durations, marker=".")
-    axes[3].set_ylabel("mean motion time [s]")
-    for axis in axes[2:]:
-        axis.set_xlabel("CPU time of training [s]")
+    axes[1].plot(_column(checks, "seconds"), durations, marker=".")
+    axes[1].set_title("mean motion time [s]")
+    _draw_violations(axes[2], steps)
     for axis in axes:
+        axis.set_xlabel("CPU time of training [s]")
         axis.grid(alpha=0.3)
     with committing(Path(path)) as temporary:
         figure.savefig(temporary, format=Path(path).suffix.removeprefix("."))
 
 
-def _draw_loss(axis: "Axes", steps: list[dict[str, Any]]) -> None:
-    seconds = _column(steps, "seconds")
-    axis.plot(seconds, _column(steps, "loss"), label="weighted sum")
-    axis.plot(
-        seconds, [record["terms"]["time"] for record in steps], label="task loss alone"
-    )
-    axis.set_ylabel("loss [s]")
-    axis.set_yscale("log")
-    _name_lines(axis)
-
-
-def _draw_terms(axis: "Axes", steps: list[dict[str, Any]]) -> None:
-    """Draw every constraint term, and its budget in the problem file as a dashed line."""
+def _draw_violations(axis: "Axes", steps: list[dict[str, Any]]) -> None:
+    """Draw the mean violations over their budgets in the problem file, or as they are if none has a budget."""
     seconds, budgets = _column(steps, "seconds"), steps[0].get("budgets", {})
-    for name in steps[0]["weights"]:
-        (line,) = axis.plot(
-            seconds,
-            [max(record["terms"][name], MIN_DRAWN_TERM) for record in steps],
-            label=name,
-        )
-        if budgets.get(name):
-            axis.axhline(
-                budgets[name], color=line.get_color(), linestyle="--", linewidth=0.8
-            )
-    axis.set_ylabel("terms (dashed: budgets)")
+    weights = steps[0]["weights"]
+    for name in [name for name in weights if budgets.get(name)] or weights:
+        values = [record["terms"][name] / (budgets.get(name) or 1) for record in steps]
+        axis.plot(seconds, [max(v, MIN_DRAWN_RATIO) for v in values], label=name)
+    axis.axhline(1, color="0.3", linestyle="--", linewidth=0.8)
+    axis.set_title("mean violation over budget")
     axis.set_yscale("log")
-    _name_lines(axis)
+    axis.legend(fontsize=8)
 
 
 def _draw_validity(axis: "Axes", checks: list[dict[str, Any]]) -> None:
@@ -120,20 +102,9 @@ def _draw_validity(axis: "Axes", checks: list[dict[str, Any]]) -> None:
                 marker=".",
                 label=label,
             )
-    axis.set_ylabel("valid plans [%]")
-    axis.set_ylim(0, 101)
-    _name_lines(axis)
-
-
-def _name_lines(axis: "Axes") -> None:
-    """Draw a legend above the axes, so that it covers no curve."""
-    axis.legend(
-        fontsize=8,
-        loc="lower center",
-        bbox_to_anchor=(0.5, 1.0),
-        ncols=4,
-        frameon=False,
-    )
+    axis.set_title("valid plans [%]")
+    axis.set_ylim(top=100.5)
+    axis.legend(fontsize=8)
 
 
 def _column(records: list[dict[str, Any]], name: str) -> list[float]:

@@ -67,6 +67,8 @@ def test_an_unknown_page_is_refused_with_the_nearest_one(capsys):
     capsys.readouterr()
     assert main(["docs", "verdct"]) == 2
     assert "has no page 'verdct' (did you mean 'verdict'?)" in capsys.readouterr().err
+    assert main(["docs", "SAFETY"]) == 2
+    assert "has no page 'SAFETY' (did you mean 'safety'?)" in capsys.readouterr().err
 
 
 SITE = "https://docs.example.org/"

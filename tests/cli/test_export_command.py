@@ -116,7 +116,7 @@ def test_plans_are_chosen_by_index_or_by_sample(run: Run, hits: Path) -> None:
 
 def test_what_is_there_is_replaced_only_by_force(run: Run, hits: Path) -> None:
     for form, out in (("npz", "x.npz"), ("csv", "x")):
-        words = (hits, "--to", form, "-o", out, "--rate", 20, "--plan", 0)
+        words = (hits, "--to", form, "-o", out, "--plan", 0)
         assert run(*words)[0] == 0
         before = [
             path.read_bytes() for path in sorted(Path().rglob("*")) if path.is_file()

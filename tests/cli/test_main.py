@@ -640,6 +640,15 @@ def test_show_tells_the_kind_of_a_file(run, kind):
     assert json.loads(run("show", path, "--json")[1])["kind"] == kind
 
 
+def test_a_part_of_a_problem_is_read_as_one(run, tmp_path):
+    path = tmp_path / "part.toml"
+    path.write_text("[drive]\nbacklash = 1\n")
+    code, _, stderr = run("show", path)
+    assert code == 2
+    assert "drive.backlash: unknown key" in stderr
+    assert "name of the problem" in stderr
+
+
 def test_show_describes_kinds_of_stages_and_constraints(run):
     assert run("show", "--stage", "start-ik")[1].startswith("stage start-ik")
     assert run("show", "--constraint", "table")[1].startswith("constraint table")

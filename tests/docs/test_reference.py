@@ -209,7 +209,7 @@ def test_the_notebook_of_a_tutorial_has_every_block_as_a_cell(
 
 
 @pytest.mark.slow
-def test_the_pictures_of_the_concepts_are_drawn_from_computed_plans(
+def test_the_pictures_of_the_pages_are_drawn_from_computed_plans(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     imread = pytest.importorskip("matplotlib.image").imread
@@ -217,10 +217,8 @@ def test_the_pictures_of_the_concepts_are_drawn_from_computed_plans(
     monkeypatch.setattr(pictures, "FOLDER", tmp_path)
     pictures.main()
     drawn = {path.name for path in tmp_path.iterdir()}
-    assert len(drawn) == 6
-    text = "".join(
-        page.read_text(encoding="utf-8") for page in (DOCS / "concepts").glob("*.md")
-    )
+    assert len(drawn) == 7
+    text = "".join(page.read_text(encoding="utf-8") for page in written_pages())
     for name in drawn:
         assert f"../images/{name}" in text
         shown, now = (imread(folder / name) for folder in (DOCS / "images", tmp_path))

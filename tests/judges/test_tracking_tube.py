@@ -1,6 +1,7 @@
 """Tracking tube: its verdict holds for random states within it, and is exact for joint limits."""
 
 import dataclasses
+import itertools
 
 import numpy as np
 import pytest
@@ -80,6 +81,25 @@ def test_the_contact_of_a_hit_is_intended_within_the_tube(error: float) -> None:
         assert distances[touches].max(initial=0) <= 3 * displacement + 1e-4
         touched += touches.sum()
     assert touched  # a hit touches the puck at its end
+
+
+@pytest.mark.parametrize("error", [1e-4, np.deg2rad(1.0)])
+def test_the_height_of_the_table_changes_by_little_less_than_the_verdict_states(
+    error: float,
+) -> None:
+    # Starts may be off the height.
+    plan, phases = load("hit"), np.linspace(0.4, 1, 200)
+    world = PathWorld(plan.robot, plan.problem.obstacle, plan.problem.object_size)
+    states = evaluate_trajectory(plan.motion, phases, jerk=False)
+    heights = []
+    for signs in itertools.product([-1, 0, 1], repeat=plan.robot.n):
+        offset = error * np.reshape(signs, (-1, 1))
+        world.set_path(states.q + offset, states.dq, states.ddq, plan.scene.poses[0])
+        heights.append(world.tip_position[2])
+    largest = np.abs(np.array(heights) - plan.problem.table_origin[2]).max()
+    margin = plan.judged(tracking_error=error).margins["table height"]
+    assert largest <= margin.violation + 1e-6
+    assert margin.violation <= largest * (1.02 if error < 1e-3 else 1.2)
 
 
 def test_a_puck_beside_the_path_needs_the_displacement_as_clearance() -> None:

@@ -1,5 +1,6 @@
 """Parameters outside of their ranges: refused, or allowed on request by a problem whose name and ranges say so."""
 
+import dataclasses
 from pathlib import Path
 
 import numpy as np
@@ -83,7 +84,9 @@ def test_files_of_other_programs_need_the_option_at_every_command(
     ):
         command, *options = words
         assert main([command, str(path), *options]) in {1, 2}
-        assert "velocity_factor must be from 0.5 to 1" in capsys.readouterr().err
+        error = capsys.readouterr().err
+        assert "velocity_factor must be from 0.5 to 1" in error
+        assert "--extrapolate allows values outside" in error
         assert main([command, str(path), *options, "--extrapolate"]) == 0
     assert (
         MARKED
@@ -99,10 +102,38 @@ def test_sampled_trajectories_are_read_with_the_option(
     slow_hit: cnpgen.Plans, tmp_path: Path
 ) -> None:
     cnpgen.export_plans(slow_hit, tmp_path / "csv", to="csv", rate=500)
-    with pytest.raises(UsageError, match=r"velocity_factor must be from 0\.5 to 1"):
+    text = r"velocity_factor must be from 0\.5 to 1.*extrapolate=True allows"
+    with pytest.raises(UsageError, match=text):
         load_trajectories(tmp_path / "csv", "airhockey-tables")
+    with pytest.raises(UsageError, match=r"velocity_factor.*parameters"):
+        load_trajectories(
+            tmp_path / "csv",
+            "airhockey-tables",
+            parameters={"velocity_factor": 0.9},
+            options=LoadOptions(extrapolate=True),
+        )
     options = LoadOptions(extrapolate=True)
     loaded = load_trajectories(tmp_path / "csv", "airhockey-tables", options=options)
     assert loaded.problem.name == MARKED
     found = cnpgen.evaluate_trajectories(loaded.problem, loaded.trajectories)
     assert found.valid.all()
+
+
+def test_values_that_change_after_the_check_are_found_when_plans_are_saved(
+    slow_hit: cnpgen.Plans, tmp_path: Path
+) -> None:
+    parameters = slow_hit.boundary.parameters
+    assert parameters is not None
+    changed = parameters.copy()
+    boundary = dataclasses.replace(slow_hit.boundary, parameters=changed)
+    plans = dataclasses.replace(slow_hit, boundary=boundary)
+    changed[:, 3] = 1.3
+    for door in (
+        lambda: cnpgen.save_plans(tmp_path / "a.h5", plans),
+        lambda: cnpgen.evaluate_plans(plans, workers=1),
+        lambda: cnpgen.refine_plans(plans, workers=1),
+        lambda: cnpgen.solve_plans(plans, workers=1),
+    ):
+        with pytest.raises(UsageError, match=r"velocity_factor must be .* got 1\.3"):
+            door()
+    assert not (tmp_path / "a.h5").exists()

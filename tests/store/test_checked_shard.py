@@ -315,3 +315,21 @@ def test_links_are_refused_by_every_reader(damaged: Path, tmp_path: Path) -> Non
     record = load_record(damaged, task)
     with pytest.raises(DatasetError, match="is a link"):
         read_checked(Shard(damaged, spec, task, record.bytes, record.sha256))
+
+
+def test_parameters_outside_of_their_ranges_are_refused_by_every_reader_and_merge(
+    tmp_path: Path,
+) -> None:
+    folder = tmp_path / "tables"
+    make_dataset("airhockey-tables", folder, n=40, workers=1)
+    rows = open_dataset(folder).spec.splits["train"]
+    edit(folder, "train/shard-00000.h5", with_values("parameters", put((3, 3), 1.3)))
+    for read in (
+        lambda: open_dataset(folder).read("train", stop=rows),
+        lambda: load_boundary_problems(folder, split="train"),
+        lambda: load_dataset(folder).arrays("train", fields=("parameters",)),
+        lambda: merge_datasets([folder], tmp_path / "out"),
+    ):
+        with pytest.raises(CnpgenError, match=r"velocity_factor .* got 1\.3 in row 3"):
+            read()
+    assert not validate_dataset(folder, deep=True, workers=1).ok

@@ -19,7 +19,15 @@ from typing import TYPE_CHECKING, Any
 
 from cnpgen.cli import recipe_names, values
 from cnpgen.cli.interruption import resumable
-from cnpgen.cli.parser import ENGINE, Parser, add_engine, add_json, options_of
+from cnpgen.cli.parser import (
+    ENGINE,
+    Parser,
+    add_engine,
+    add_json,
+    options_of,
+    refuse,
+    refuse_others,
+)
 from cnpgen.cli.terminal import Meter, table
 from cnpgen.errors import CnpgenError, UsageError
 
@@ -55,6 +63,15 @@ def add_options(parser: Parser) -> None:
         type=values.positive,
         help="number of problems; a random suite has any number",
     )
+    _add_execution(parser)
+    _add_planning(parser)
+    _add_comparison(parser)
+    add_json(parser)
+
+
+def _add_execution(parser: Parser) -> None:
+    """Add the options of the simulated execution."""
+    option = parser.add_argument
     option("--simulate", action="store_true", help="also execute the plans")
     option(
         "--plant",
@@ -69,6 +86,11 @@ def add_options(parser: Parser) -> None:
         action="store_true",
         help="film the first plan of every planner for the report",
     )
+
+
+def _add_planning(parser: Parser) -> None:
+    """Add the options of the runs of planners."""
+    option = parser.add_argument
     option(
         "--time-limit",
         metavar="S",
@@ -94,6 +116,11 @@ def add_options(parser: Parser) -> None:
         default=1,
         help="repetitions of every problem (default: 1)",
     )
+
+
+def _add_comparison(parser: Parser) -> None:
+    """Add the options of the comparison, of the planners' fields and of earlier results."""
+    option = parser.add_argument
     text = "largest distance of the mallet of a successful hit from the table plane (default: 20mm)"
     option(
         "--plane-tolerance", metavar="M", type=values.meters, default=0.02, help=text
@@ -119,7 +146,6 @@ def add_options(parser: Parser) -> None:
     )
     text = "delete results of another suite, version, time limit, seed or planner parameters in DIR"
     option("--force", action="store_true", help=text)
-    add_json(parser)
 
 
 def parameter(text: str) -> tuple[str, str, Any]:
@@ -141,15 +167,16 @@ def run(arguments: argparse.Namespace) -> None:
     from cnpgen.addons.benchmark.result_tables import save_benchmark_tables
 
     if arguments.list:
+        refuse_others(arguments, "list")
         print(_listing(as_json=arguments.json))
         return
     if arguments.suite is None:
         raise UsageError(
             "the argument SUITE is missing; 'cnpgen benchmark --list' lists suites"
         )
-    for name in ("plant", "environment", "video"):
-        if getattr(arguments, name) and not arguments.simulate:
-            raise UsageError(f"--{name} needs --simulate")
+    if not arguments.simulate:
+        names = ("plant", "environment", "video")
+        refuse(arguments, names, "{} needs --simulate")
     folder = arguments.out or Path(f"{Path(arguments.suite).stem}-results")
     found = _run(arguments, folder)
     save_benchmark_tables(found, folder)

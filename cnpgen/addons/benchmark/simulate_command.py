@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from cnpgen.cli import recipe_names, values
-from cnpgen.cli.parser import Parser, add_json
+from cnpgen.cli.parser import Parser, add_json, refuse
 from cnpgen.cli.terminal import Meter, table
 from cnpgen.errors import UsageError, counted
 
@@ -71,6 +71,12 @@ def add_options(parser: Parser) -> None:
         type=values.positive,
         help="processes; default one per available core",
     )
+    _add_outputs(parser)
+
+
+def _add_outputs(parser: Parser) -> None:
+    """Add the options of what is printed and drawn."""
+    option = parser.add_argument
     option("--list", action="store_true", help="also list the plans, one per line")
     option(
         "--plan",
@@ -93,6 +99,8 @@ def add_options(parser: Parser) -> None:
 def run(arguments: argparse.Namespace) -> int:
     from cnpgen.addons.benchmark.simulator.simulate import simulate_plans
 
+    if not (arguments.image or arguments.video):
+        refuse(arguments, ["plan"], "{} needs --image or --video")
     plans = recipe_names.read_plans(arguments.file, problem=arguments.problem)
     if arguments.plan >= len(plans):
         raise UsageError(

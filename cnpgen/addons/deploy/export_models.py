@@ -14,7 +14,7 @@ from cnpgen.cli.parser import Options, refuse
 from cnpgen.errors import UsageError
 
 FORMAT = "c"
-_OF_PLANS = ("rate", "plan", "sample", "join", "at", "scenes")
+_OF_PLANS = ("rate", "plan", "sample", "join", "at", "scenes", "allow_unused")
 
 
 def add_options(options: Options) -> None:
@@ -49,9 +49,9 @@ def run(arguments: argparse.Namespace) -> int:
         raise UsageError(
             f"a model is exported with --to {FORMAT}, got {arguments.to!r} (other formats are of plans)"
         )
-    for name in _OF_PLANS:
-        if getattr(arguments, name, None) is not None:
-            raise UsageError(f"--{name} is for plans, and {arguments.file} is a model")
+    # Options of other add-ons may be missing.
+    names = [name for name in _OF_PLANS if name in arguments]
+    refuse(arguments, names, f"{{}} is for plans, and {arguments.file} is a model")
     folder: Path = arguments.out or Path(f"{arguments.file.stem}-{FORMAT}")
     if folder.exists() and not folder.is_dir():
         raise UsageError(f"{folder} is a file: a planner is written into a folder")

@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any
 
 from cnpgen.cli import recipe_names, values
-from cnpgen.cli.parser import Parser, add_json
+from cnpgen.cli.parser import Parser, add_json, refuse_others
 from cnpgen.cli.terminal import Meter
 from cnpgen.errors import RecipeError, UsageError, counted
 
@@ -80,6 +80,7 @@ def run(arguments: argparse.Namespace) -> None:
     from cnpgen.addons.scene_files.scene_files import save_scenes
 
     if arguments.list:
+        refuse_others(arguments, "list")
         print(_listing(as_json=arguments.json))
         return
     needed = {

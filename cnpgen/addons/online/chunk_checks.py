@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import ArrayLike
 
+from cnpgen.addons.online.plan_runtime import positive
 from cnpgen.addons.trajectories.refuted_limits import refuted_limits
 from cnpgen.addons.trajectories.sample_errors import SampleErrors
 from cnpgen.addons.trajectories.sampled_trajectory import Trajectory
@@ -25,6 +26,7 @@ from cnpgen.world.path import PathWorld
 MIN_CHUNK_SAMPLES = 8  # of a chunk after the join: fewer have no reliable velocity
 MAX_DURATION = 1.2  # of a motion, in chunk lengths
 SAMPLE_ROUNDING = 1e-6  # samples
+TIMES_S = 1e-3, 60.0  # range of options
 NOISE_RAD = 1e-3
 MAX_RESTING_SPEED = 0.05  # fraction of the velocity limits, of an arm that is at rest
 
@@ -38,6 +40,9 @@ class ChunkOptions:
             no motion within it meets the limits of velocities, accelerations and jerks.
         stop_after: Time after a join at which the arm rests at the latest without
             another chunk [s]; by default 1.2 chunk lengths. Later samples are not used.
+
+    Raises:
+        UsageError: A value has another type, or is outside of its range.
     """
 
     noise: float = NOISE_RAD
@@ -45,6 +50,9 @@ class ChunkOptions:
 
     def __post_init__(self) -> None:
         check_fields(self)
+        positive("noise", self.noise)
+        if self.stop_after is not None:
+            bounded("stop_after", self.stop_after, *TIMES_S, "s")
 
 
 class ChunkChecks:

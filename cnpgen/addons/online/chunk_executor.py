@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike
 from cnpgen.addons.online.callers_clock import ROUNDING_S, CallersClock
 from cnpgen.addons.online.chunk_checks import (
     MIN_CHUNK_SAMPLES,
+    TIMES_S,
     ChunkChecks,
     ChunkOptions,
     bounded,
@@ -34,7 +35,7 @@ from cnpgen.schema.argument_types import checked_arguments
 from cnpgen.schema.arguments import integer, number
 from cnpgen.store.dataset_spec import StoredProblem
 
-RATES_HZ, TIMES_S = (0.1, 1000.0), (1e-3, 60.0)  # ranges of options
+RATES_HZ = 0.1, 1000.0  # range of an option
 MAX_CHUNK_SAMPLES, MAX_SPEED = 1000, 10.0
 STOP_DELAY_S = 0.05  # of a stop after its cause: it is computed meanwhile
 MAX_POSITION = 1e6  # rad or m, of a chunk
@@ -106,15 +107,13 @@ class ChunkExecutor:
         self._tracking_error = checked_errors(tracking_error, self._robot.n)
         max_speed = bounded("speed", speed, 1.0, MAX_SPEED, "times the own one")
         options = options or ChunkOptions()
-        if (stop_after := options.stop_after) is not None:
-            stop_after = bounded("stop_after", stop_after, *TIMES_S, "s")
-        self._horizon = horizon(stop_after, self._length, self._rate)
+        self._horizon = horizon(options.stop_after, self._length, self._rate)
         self._checks = ChunkChecks(
             opened,
             self._robot,
             length=self._length,
             rate=self._rate,
-            noise=positive("noise", options.noise),
+            noise=options.noise,
         )
         self._motions = ChunkMotions(self._record, self._rate, max_speed)
         # Numbers of samples that delays leave, one of each parametrization of motions.

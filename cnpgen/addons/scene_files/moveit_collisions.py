@@ -8,7 +8,7 @@ from typing import Any
 
 from cnpgen.problems.scenes.scene_problem import SceneError
 from cnpgen.problems.scenes.yaml_document import part, scalar
-from cnpgen.store.files.accounted import AccountedMapping, mark_read
+from cnpgen.store.files.accounted import AccountedMapping
 
 MAX_SCALE, MAX_PADDING_M = 10.0, 1.0
 ACM, OCTOMAP = "allowed_collision_matrix", "<octomap>"
@@ -75,7 +75,6 @@ def read_allowed_collisions(
     if refused:
         text = "expected pairs, or names without a default of false that all may touch"
         scene.account.refuse(ACM, refused[0], text)
-    mark_read(matrix)
     ignored = frozenset(world) & frozenset(always)
     found = {body: tuple(links) for body, links in touching.items()}
     return AllowedCollisions(found, ignored)

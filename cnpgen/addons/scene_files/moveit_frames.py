@@ -116,9 +116,13 @@ def rotation_of(xyzw: Any, where: str) -> Array:
 
 def add_fixed_frames(table: FrameTable, scene: Any, place: str) -> None:
     """Add the ``fixed_frame_transforms`` of a scene."""
+    names = set[str]()
     for entry in part(scene, "fixed_frame_transforms", list, place):
         where = f"{place}: fixed_frame_transforms"
         name = part(entry, "child_frame_id", str, where)
+        if name in names:
+            raise SceneError(f"{where} has the frame {name!r} twice")
+        names.add(name)
         pose = transform_of(part(entry, "transform", dict, where), where)
         parent = frame_id(entry, where)
         if name and name != parent and not (name in BASE_FRAMES and pose is IDENTITY):

@@ -117,6 +117,7 @@ def read_object(entry: Any, where: str) -> CollisionObject:
         raise SceneError(
             f"{where} has {len(names)} subframe_names and {len(poses)} subframe_poses, expected equal numbers"
         )
+    _check_different(names, where)
     return CollisionObject(
         name=str(entry.get("id", "object")),
         frame=frame_id(entry, where),
@@ -173,11 +174,18 @@ def _appended(
         raise SceneError(
             f"{where} is appended to in another frame or pose than it was added in"
         )
+    _check_different([name for name, _ in (*item.subframes, *more.subframes)], where)
     return replace(
         item,
         shapes=(*item.shapes, *more.shapes),
         subframes=(*item.subframes, *more.subframes),
     )
+
+
+def _check_different(names: list[str], where: str) -> None:
+    """Raise SceneError for a subframe that an object has twice."""
+    if twice := [name for name in names if names.count(name) > 1]:
+        raise SceneError(f"{where} has the subframe {twice[0]!r} twice")
 
 
 def add_object_frames(table: FrameTable, objects: dict[str, CollisionObject]) -> None:

@@ -235,7 +235,6 @@ def _states(
             "multi_dof_joint_state",
             "start_state replaces robot_state: give the placement there",
         )
-    mark_read(base)
     return start, [present, start] if is_difference else [start]
 
 

@@ -11,20 +11,21 @@ from typing import Any
 
 import numpy as np
 
+from cnpgen.addons.scene_files.moveit_collisions import is_true
 from cnpgen.addons.scene_files.moveit_frames import (
     FrameTable,
     composed,
     frame_id,
     optional_pose,
 )
-from cnpgen.arrays import Array
-from cnpgen.errors import UsageError
-from cnpgen.problems.scenes.placement import moved_obstacle
-from cnpgen.problems.scenes.point_cloud import (
+from cnpgen.addons.scene_files.point_cloud import (
     MAX_POINTS,
     MIN_VOXEL_M,
     obstacles_of_points,
 )
+from cnpgen.arrays import Array
+from cnpgen.errors import UsageError
+from cnpgen.problems.scenes.placement import moved_obstacle
 from cnpgen.problems.scenes.scene_problem import MAX_SCENE_OBSTACLES, SceneError
 from cnpgen.problems.scenes.yaml_document import part, scalar, vector
 from cnpgen.robots.obstacle import Obstacle
@@ -50,7 +51,11 @@ def read_octomap(
     message = part(world, "octomap", dict, place)
     tree = part(message, "octomap", dict, place)
     if not part(tree, "data", list, place):
-        mark_read(message)
+        # An empty map has no frame; other keys may be misspelt ones.
+        for key in ("header", "origin"):
+            mark_read(part(message, key, dict, place))
+        for key in ("id", "resolution", "binary"):
+            tree.get(key)
         return
     where = f"{place}: octomap"
     kind = part(tree, "id", str, where)
@@ -68,7 +73,7 @@ def read_octomap(
         raise SceneError(f"{where}: data must be bytes")
     # Messages have signed bytes, octrees unsigned ones.
     data = (values.astype(int) % 256).astype(np.uint8).tobytes()
-    is_binary = str(tree.get("binary", "false")).strip().lower() in {"true", "1", "1.0"}
+    is_binary = is_true(tree.get("binary"), f"{where}: binary")
     cells = decoded_cells(data, is_binary=is_binary, where=where)
     frame, pose = table.resolve(
         frame_id(message, where),

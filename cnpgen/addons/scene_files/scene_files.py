@@ -32,7 +32,7 @@ from cnpgen.problems.scenes.scene_reader import ReadingOptions
 from cnpgen.problems.scenes.yaml_document import read_yaml
 from cnpgen.schema.argument_types import checked_arguments
 from cnpgen.schema.arguments import integer
-from cnpgen.store.files.accounted import Account
+from cnpgen.store.files.accounted import Account, check_allowed
 from cnpgen.store.files.atomic import write_file
 from cnpgen.store.files.kind import HDF5_SUFFIXES, is_hdf5
 
@@ -52,6 +52,7 @@ def load_scenes(
     allow_unused: Sequence[str] = (),
     packages: Sequence[str | Path] = (),
     present: Mapping[str, float] | None = None,
+    allowed_elsewhere: Sequence[str] = (),
 ) -> list[SceneProblem]:
     """Read the planning problems of scene files.
 
@@ -71,9 +72,11 @@ def load_scenes(
             relative to their scene.
         present: Joint -> position [rad], the state of the robot that an empty
             ``start_state`` of MoveIt means.
+        allowed_elsewhere: Further keys as ``allow_unused``, which the scenes may lack.
 
     Raises:
-        UsageError: There are no scenes.
+        UsageError: There are no scenes, or a key of ``allow_unused`` names no element
+            that would be refused.
         SceneError: A scene is invalid; the message names file, scene and obstacle. A
             subclass of UsageError.
         DatasetError: An HDF5 file is damaged.
@@ -91,7 +94,7 @@ def load_scenes(
             f"must be folders, there is no {missing[0]}", argument="packages"
         )
     options = ReadingOptions(
-        tuple(allow_unused), tuple(map(Path, packages)), present or {}
+        (*allow_unused, *allowed_elsewhere), tuple(map(Path, packages)), present or {}
     )
     files, allowed = _files(path), options.allow_unused
     if len(files) == 1 and _is_hdf5(files[0]):
@@ -108,7 +111,10 @@ def load_scenes(
         )
     if not scenes:
         raise UsageError(f"{path} has no scene from number {start} on", concerns="path")
-    _report(path, [account for _, account in found])
+    accounts = [account for _, account in found]
+    unused = [name for each in accounts for name in (*each.unused, *each.accepted)]
+    check_allowed(allow_unused, unused, set().union(*(each.keys for each in accounts)))
+    _report(path, accounts)
     return [checked_scene(scene) for scene in scenes]
 
 

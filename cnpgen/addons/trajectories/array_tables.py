@@ -48,17 +48,16 @@ def read_npz(path: Path, _: LoadOptions) -> Iterator[TrajectoryTable]:
 def read_hdf5_tables(path: Path, _: LoadOptions) -> Iterator[TrajectoryTable]:
     """Yield the trajectories of datasets; attributes give the names of joints and the units."""
     with open_hdf5(path) as file:
-        names: tuple[str, ...] = ()
-        if JOINT_NAMES in file.attributes:
-            names = file.attributes.texts(JOINT_NAMES)
-        if JOINT_NAMES in file.names():
-            others = file.texts(JOINT_NAMES)
-            if names and others != names:
-                raise UsageError(
-                    f"{path}: the attribute {JOINT_NAMES} names {', '.join(names)}, the dataset {', '.join(others)}"
-                )
-            names = others
         columns = file.columns(without=(JOINT_NAMES,))
+        holders = [file.attributes, *(each.attributes for each in columns.values())]
+        stated = [each.texts(JOINT_NAMES) for each in holders if JOINT_NAMES in each]
+        if JOINT_NAMES in file.names():
+            stated.append(file.texts(JOINT_NAMES))
+        if len(set(stated)) > 1:
+            raise UsageError(
+                f"{path}: {JOINT_NAMES} differ: {', '.join(stated[0])} and {', '.join(stated[-1])}"
+            )
+        names = stated[0] if stated else ()
         arrays = {name: column.read() for name, column in columns.items()}
         units, unused = dict[str, str](), [*(set(file.names()) - set(file))]
         unused += [f"attribute {name}" for name in file.attributes]
@@ -66,7 +65,7 @@ def read_hdf5_tables(path: Path, _: LoadOptions) -> Iterator[TrajectoryTable]:
             for attribute in column.attributes:
                 if attribute in UNIT_ATTRIBUTES:
                     (units[name],) = column.attributes.texts(attribute)
-                else:
+                elif attribute != JOINT_NAMES:
                     unused.append(f"attribute {attribute} of {name}")
     known = {f"attribute {JOINT_NAMES}", JOINT_NAMES}
     unused = [name for name in unused if name not in known]

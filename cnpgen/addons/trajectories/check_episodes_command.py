@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from cnpgen.cli import values
-from cnpgen.cli.parser import Parser
+from cnpgen.cli.parser import Parser, refuse
 from cnpgen.errors import UsageError, listed
 
 if TYPE_CHECKING:
@@ -62,6 +62,12 @@ def run(arguments: argparse.Namespace) -> int:
         raise UsageError("--noise is one number, the error of positions [rad]")
     recording = read_recording(arguments.path, key=arguments.key, rate=arguments.rate)
     arm = _arm(arguments, recording)
+    if recording.kind != "hdf5":
+        refuse(arguments, ["key"], "{} is for HDF5 files")
+    if arm is None:
+        refuse(arguments, ["joints", "unit", "calibration"], "{} needs --arm")
+    if arguments.calibration is not None:
+        refuse(arguments, ["unit"], "{} is not for values with a --calibration")
     episodes = chosen(recording, _numbers(arguments.episodes))
     reports = [
         check_episode(
@@ -120,7 +126,12 @@ def _scale(
     if arguments.calibration is not None:
         factor = _calibrated(arguments.calibration, arm)
         return Scale(columns, np.array(factor), has_zero=False)
-    if arguments.unit is None and arm.is_normalized:
+    if episode.has_units and arguments.unit is not None:
+        text = (
+            f"--unit is for columns without a unit, those of {episode.name} have some"
+        )
+        raise UsageError(text)
+    if arguments.unit is None and arm.is_normalized and not episode.has_units:
         return None
     unit = np.pi / 180 if arguments.unit == "deg" else 1.0
     return Scale(columns, np.full(len(columns), unit))
@@ -130,17 +141,23 @@ def _columns(
     names: tuple[str, ...] | None, arm: "RecordedArm", episode: "Episode"
 ) -> tuple[int, ...]:
     """Return the column of each joint of an arm."""
+    from cnpgen.addons.trajectories.episode_files import joint_name
+
     wanted = arm.joints if names is None else names
     if len(wanted) != len(arm.joints):
         raise UsageError(
             f"--joints must have {len(arm.joints)} names, got {len(wanted)}"
         )
     found = []
-    for joint in wanted:
+    for joint in map(joint_name, wanted):
         spellings = [f"{joint}{suffix}" for suffix in JOINT_SUFFIXES]
-        column = next(
-            (episode.names.index(s) for s in spellings if s in episode.names), None
-        )
+        # A prefix of the robot, as in "panda_joint1", if it is of one column.
+        # "dq panda_joint1" has a space, and velocities.
+        longer = [name for name in episode.names if name.endswith(f"_{joint}")]
+        longer = [name for name in longer if " " not in name]
+        spellings += longer if len(longer) == 1 else []
+        known = [name for name in spellings if name in episode.names]
+        column = episode.names.index(known[0]) if known[:1] else None
         if (
             column is None
             and names is not None

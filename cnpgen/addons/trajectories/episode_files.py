@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from cnpgen.addons.trajectories.lerobot_tables import LEROBOT_INFO
 from cnpgen.addons.trajectories.parquet_tables import read_parquet
+from cnpgen.addons.trajectories.table_units import plain, stated_factor
 from cnpgen.addons.trajectories.trajectory_tables import read_trajectory_tables
 from cnpgen.arrays import Array
 from cnpgen.errors import DatasetError, UsageError, listed
@@ -24,6 +25,7 @@ STATE, ACTION = "observation.state", "action"
 ROBOMIMIC_KEY = "obs/robot0_joint_pos"
 NOMINAL_TOLERANCE = 1e-3  # of a period, of times that are a grid
 TIME_COLUMNS = ("t", "time", "timestamp", "time_from_start")
+_HAS_TIMES = "is for data without times, {} has some"
 LEROBOT_HOME = "HF_LEROBOT_HOME"
 
 
@@ -39,6 +41,7 @@ class Episode:
         names: Names of the measured values.
         frame: Index of every frame, shape (K,).
         length: Number of frames that the description states, or None.
+        has_units: Whether columns stated their units: their values are in SI units.
     """
 
     name: str
@@ -48,6 +51,7 @@ class Episode:
     names: tuple[str, ...]
     frame: NDArray[np.int64]
     length: int | None = None
+    has_units: bool = False
 
     @property
     def is_nominal(self) -> bool:
@@ -94,6 +98,8 @@ def read_recording(
         text = f"{path} is not there, neither as a path nor in {folder.parent}"
         raise UsageError(text, concerns="path")
     if (folder / LEROBOT_INFO).is_file():
+        if rate is not None:
+            raise UsageError(_HAS_TIMES.format(folder), argument="rate")
         return _read_lerobot(folder)
     if folder.is_file() and folder.suffix.lower() in HDF5_SUFFIXES:
         return _read_hdf5(folder, key, rate)
@@ -239,12 +245,18 @@ def _read_tables(path: Path, rate: float | None) -> Recording:
     """Read one episode of each table, such as the CSV files of a folder."""
     episodes = []
     for table in read_trajectory_tables(path):
-        columns = {
-            name: values.astype(float)
-            for name, values in table.columns.items()
-            if values.ndim == 1 and values.dtype.kind in "biuf"
-        }
-        times = [name for name in columns if name.split(" ")[0].lower() in TIME_COLUMNS]
+        columns, has_units = dict[str, Array](), False
+        for name, values in table.columns.items():
+            if values.ndim == 1 and values.dtype.kind in "biuf":
+                stated = stated_factor(name)
+                if stated is not None and not stated[0]:
+                    text = f"{table.place}: {name!r} has an unknown unit"
+                    raise UsageError(text, concerns="path")
+                has_units |= stated is not None and stated[0] in {"rad", "m"}
+                columns[joint_name(name)] = values * (
+                    1.0 if stated is None else stated[1]
+                )
+        times = [name for name in columns if name.lower() in TIME_COLUMNS]
         names = tuple(name for name in columns if name not in times)
         if not names:
             raise UsageError(
@@ -255,9 +267,18 @@ def _read_tables(path: Path, rate: float | None) -> Recording:
         if not times and rate is None:
             text = f"{table.place} has no times: state {{rate}}"
             raise UsageError(text, remedies={"rate": 30})
+        if times and rate is not None:
+            raise UsageError(_HAS_TIMES.format(table.place), argument="rate")
         t = columns[times[0]] if times else frame / (rate or 1.0)
-        episodes.append(Episode(Path(table.place).name, t, state, None, names, frame))
+        name = Path(table.place).name
+        episode = Episode(name, t, state, None, names, frame, has_units=has_units)
+        episodes.append(episode)
     return Recording(tuple(episodes), "", "csv")
+
+
+def joint_name(column: str) -> str:
+    """Return the joint of a column of positions, such as "q joint_1 [rad]"; other names without their unit."""
+    return plain(column).removeprefix("q ")
 
 
 def chosen(recording: Recording, episodes: Sequence[int] | None) -> tuple[Episode, ...]:

@@ -7,7 +7,8 @@
 import argparse
 
 from cnpgen.cli import export_command, recipe_names
-from cnpgen.cli.parser import Options, StoreOnce
+from cnpgen.cli.parser import Options, refuse
+from cnpgen.cli.refine_command import ALLOW_UNUSED
 from cnpgen.errors import UsageError
 
 
@@ -18,13 +19,17 @@ def add_options(options: Options) -> None:
         "--scenes",
         metavar="FILE",
         type=recipe_names.present,
-        action=StoreOnce,
         help=text,
+    )
+    options.add_argument(
+        "--allow-unused", metavar="KEY", action="append", help=ALLOW_UNUSED
     )
 
 
 def accepts(arguments: argparse.Namespace) -> bool:
     """Return whether scenes are given."""
+    if arguments.scenes is None:
+        refuse(arguments, ["allow_unused"], "{} needs --scenes")
     return arguments.scenes is not None
 
 
@@ -41,5 +46,5 @@ def run(arguments: argparse.Namespace) -> int:
     if arguments.join:
         raise UsageError("--scenes is for plans without --join")
     plans = recipe_names.read_plans(arguments.file)
-    placed = plans_in_scenes(plans, arguments.scenes)
+    placed = plans_in_scenes(plans, arguments.scenes, arguments.allow_unused or ())
     return export_command.export(arguments, placed, sources=[arguments.scenes])

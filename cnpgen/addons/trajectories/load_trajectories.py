@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from pathlib import Path
@@ -29,12 +29,18 @@ from cnpgen.problems.problem_record import (
     open_problem,
 )
 from cnpgen.problems.scenes.scene_problem import SceneProblem
+from cnpgen.problems.scenes.scene_reader import ReadingOptions
 from cnpgen.robots.parameter_ranges import PARAMETER_UNITS
 from cnpgen.robots.plausible_values import UnitError, find_implausible_value
 from cnpgen.robots.robot import Robot
 from cnpgen.schema.argument_types import checked_arguments
 from cnpgen.schema.old_keywords import with_old_keywords
 from cnpgen.store.dataset_spec import StoredProblem
+from cnpgen.store.files.accounted import check_allowed, unmatched
+
+# Elements beside columns that say what their numbers mean, and attributes of HDF5 that do.
+_OF_NAMES = "joint_name", "joints", "names", "unit", "units"
+_OF_NUMBERS = "scale", "scale_factor", "offset", "add_offset"
 
 
 @dataclass(frozen=True, eq=False)
@@ -138,13 +144,23 @@ def load_trajectories(
     for reader, trajectory in zip(readers, trajectories, strict=True):
         reader.check_units(trajectory)
     ignored = dict.fromkeys(name for reader in readers for name in reader.unused())
+    # Keys of messages may be missing in scenes; the other ones must be there.
+    keys = unmatched(chosen.allow_unused, [*ignored, *map(_key_of, ignored)])
+    _check_meaning(path, ignored, chosen.allow_unused)
+    if scenes is None:
+        check_allowed(keys, [], ignored)
     if chosen.extrapolate:
         values = [each.parameters for each in trajectories]
         stated = [row for row in values if row is not None]
         record = extrapolated_record(record, np.array(stated)) if stated else record
     if scenes is not None:
         record, trajectories = with_scenes(
-            record, trajectories, scenes, allow_unused=chosen.allow_unused
+            record,
+            trajectories,
+            scenes,
+            options=ReadingOptions(
+                keys, allowed_elsewhere=sorted({*chosen.allow_unused}.difference(keys))
+            ),
         )
     return LoadedTrajectories(
         record,
@@ -153,6 +169,29 @@ def load_trajectories(
         tuple(ignored),
         tuple(dict.fromkeys(note for reader in readers for note in reader.notes)),
     )
+
+
+def _key_of(name: str) -> str:
+    """Return the key of an unused element: "scale" of "attribute scale of q"."""
+    return name.removeprefix("attribute ").partition(" of ")[0].lower()
+
+
+def _check_meaning(
+    path: str | Path, ignored: Iterable[str], allowed: Sequence[str]
+) -> None:
+    """Refuse unused elements that say what numbers mean, unless their loss is accepted."""
+    for name in ignored:
+        key, is_attribute = _key_of(name), name.startswith("attribute ")
+        known = {*_OF_NAMES, *_OF_NUMBERS} if is_attribute else _OF_NAMES
+        if key in known and key not in allowed:
+            text = (
+                f"{path}: {name!r} is not used and may change the meaning of columns:"
+            )
+            raise UsageError(
+                f"{text} expected 'joint_names', or units in the names of columns; {{allow_unused}} leaves it unused",
+                concerns="path",
+                remedies={"allow_unused": key},
+            )
 
 
 def _names(

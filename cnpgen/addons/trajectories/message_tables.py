@@ -47,6 +47,8 @@ _SUCCESS = 1  # moveit_msgs/MoveItErrorCodes
 UNUSED_ELEMENTS = UnusedElements(
     {
         "header": "time of publishing; the points have times of their own",
+        "multi_dof_joint_trajectory.joint_names": "it has no points",
+        "multi_dof_trajectory.joint_names": "it has no points",
         "header.seq": "number of the message",
         "header.frame_id": "positions of joints have no frame",
         "effort": "torques follow from the motion",
@@ -72,6 +74,8 @@ UNUSED_ELEMENTS = UnusedElements(
         "component_goal_tolerance": "of a controller",
         "goal_time_tolerance": "of a controller",
         "executed_trajectory": "the planned one is read",
+        "trajectory_start.multi_dof_joint_state": "scenes place the base",
+        "start_state.multi_dof_joint_state": "scenes place the base",
     },
 )
 
@@ -155,17 +159,13 @@ def _check_message(message: Mapping[str, Any], place: str) -> None:
             raise UsageError(
                 f"{place}: {name} has points: the base of the robot must not move"
             )
-        mark_read(other)
     for name in _STARTS:
         state = message.get(name)
-        if isinstance(state, dict):
-            if state.get("attached_collision_objects"):
-                raise UsageError(
-                    f"{place}: {name} has attached objects: {{scenes}} gives a scene with them",
-                    remedies={"scenes": None},
-                )
-            # Poses of virtual joints.
-            mark_read(state.get("multi_dof_joint_state"))
+        if isinstance(state, dict) and state.get("attached_collision_objects"):
+            raise UsageError(
+                f"{place}: {name} has attached objects: {{scenes}} gives a scene with them",
+                remedies={"scenes": None},
+            )
     code = message.get("error_code", {"val": _SUCCESS})
     value = code.get("val") if isinstance(code, dict) else code
     if value != _SUCCESS:
@@ -317,7 +317,7 @@ def _seconds(stamp: Any, where: str) -> Fraction:
     parts: list[Any] = [stamp, 0]
     if isinstance(stamp, dict):
         parts = [
-            stamp.get(first, stamp.get(second, 0))
+            stamp.get(first if first in stamp else second, 0)
             for first, second in (("sec", "secs"), ("nanosec", "nsecs"))
         ]
     if all(

@@ -116,7 +116,9 @@ class TableReader:
                 self.record.parameters.checked(parameters)
             trajectory = Trajectory(**rows, parameters=parameters, obstacle_poses=poses)
         except UsageError as error:
-            raise self._error(str(error)) from error
+            # The command spells the remedies.
+            text = str(error.args[0] if error.remedies else error)
+            raise self._error(text, remedies=error.remedies) from error
         return trajectory
 
     def check_units(self, trajectory: Trajectory) -> None:
@@ -216,7 +218,12 @@ class TableReader:
                 raise self._error(
                     f"{name} must have one value, got {values[0]:g} and {values[-1]:g}"
                 )
-            found[parameter] = float(values[0]) * self._factor(name, unit, 1.0)
+            value = float(values[0]) * self._factor(name, unit, 1.0)
+            if found.setdefault(parameter, value) != value:
+                raise self._error(
+                    f"{name} is {value:g}, {{parameters}} gives another value",
+                    remedies={"parameters": f"{parameter}={found[parameter]:g}"},
+                )
         if not ranges or found.keys() != set(ranges.names):
             return None
         return np.array([found[name] for name in ranges.names])

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from cnpgen.cli import recipe_names, values
-from cnpgen.cli.parser import Options, StoreOnce, options_of
+from cnpgen.cli.parser import Options, options_of
 from cnpgen.cli.terminal import table
 from cnpgen.cli.verdict_text import margin_cells, margin_head
 from cnpgen.errors import UsageError, counted, listed
@@ -90,11 +90,10 @@ def add_trajectory_options(option: Options) -> None:
         "--scenes",
         metavar="FILE",
         type=recipe_names.present,
-        action=StoreOnce,
         help=text,
     )
     text = "topic of a bag of ROS, if several have trajectories"
-    add("--topic", metavar="NAME", action=StoreOnce, help=text)
+    add("--topic", metavar="NAME", help=text)
     text = "element of a message or scene that may be left unused; may be repeated"
     add("--allow-unused", metavar="KEY", action="append", help=text)
     text = "body at the tip, in place of the problem's: mass [kg], or mass and centre of mass in the tip frame [m]"
@@ -183,6 +182,8 @@ def write_json(
 
 def summary_text(file: Path, found: "TrajectoryEvaluation") -> str:
     """Return the counts, and for every condition the decisions with the worst margin."""
+    from cnpgen.addons.trajectories.contradicting_columns import CONTRADICTION
+
     counts = ", ".join(
         f"{count:,} {statement}" for statement, count in found.statements.items()
     )
@@ -227,13 +228,13 @@ def summary_text(file: Path, found: "TrajectoryEvaluation") -> str:
     if summary["conditions"]:
         lines += [*table(decided, indent="  ", right=(1, 2, 3, 4, 5)), ""]
         lines += table(margins, indent="  ", right=(1, 2, 3, 5, 6))
-    lines += [
-        "",
-        *(
-            f"  {count:,} because of: {reason}"
-            for reason, count in summary["reasons"].items()
-        ),
-    ]
+    # Of each reason, the first proof is printed.
+    proofs = {v.reason: f": {v.detail}" for v in reversed(found.verdicts) if v.detail}
+    lines.append("")
+    for reason, count in summary["reasons"].items():
+        lines.append(f"  {count:,} because of: {reason}{proofs.get(reason, '')}")
+    if CONTRADICTION in summary["reasons"]:
+        lines.append("  --ignore-velocities judges the positions alone")
     return "\n".join(lines).rstrip()
 
 

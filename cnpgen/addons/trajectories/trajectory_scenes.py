@@ -39,7 +39,11 @@ from cnpgen.problems.problem_record import (
 from cnpgen.problems.scenes.placement import placed_scene
 from cnpgen.problems.scenes.requested_problem import requested_problem
 from cnpgen.problems.scenes.scene_problem import SceneProblem, check_scenes
-from cnpgen.problems.scenes.scene_reader import ReadingOptions, read_scenes
+from cnpgen.problems.scenes.scene_reader import (
+    DEFAULT_OPTIONS,
+    ReadingOptions,
+    read_scenes,
+)
 from cnpgen.robots.attached_links import attached_link_name
 from cnpgen.robots.obstacle import Obstacle
 from cnpgen.robots.scene import PARKED_POSITION_M
@@ -47,6 +51,7 @@ from cnpgen.robots.urdf import urdf_tree
 from cnpgen.schema.arguments import concerning
 from cnpgen.schema.catalogue import find_recipe
 from cnpgen.schema.toml import Kind, read_table
+from cnpgen.store.files.accounted import check_allowed
 from cnpgen.store.files.kind import PLANS
 from cnpgen.store.paths import file_kind
 from cnpgen.store.scene_table import OBSTACLE_POSES
@@ -76,7 +81,7 @@ def with_scenes(
     trajectories: Sequence[Trajectory],
     scenes: str | Path | Sequence[SceneProblem],
     *,
-    allow_unused: Sequence[str] = (),
+    options: ReadingOptions = DEFAULT_OPTIONS,
 ) -> tuple[ProblemRecord, tuple[Trajectory, ...]]:
     """Place the obstacles of scenes around trajectories: one scene for each, or one for all.
 
@@ -94,7 +99,7 @@ def with_scenes(
         scenes,
         counted(len(trajectories), "trajectory"),
         len(trajectories),
-        allow_unused,
+        options,
     )
     for index, (trajectory, row) in enumerate(zip(trajectories, rows, strict=True)):
         own = trajectory.obstacle_poses
@@ -110,7 +115,9 @@ def with_scenes(
     )
 
 
-def plans_in_scenes(plans: Plans, scenes: str | Path) -> Plans:
+def plans_in_scenes(
+    plans: Plans, scenes: str | Path, allow_unused: Sequence[str] = ()
+) -> Plans:
     """Place the obstacles of scenes around plans that have none: one scene for each, or one for all.
 
     The status of the plans is unknown then. Errors are those of ``with_scenes``.
@@ -118,8 +125,9 @@ def plans_in_scenes(plans: Plans, scenes: str | Path) -> Plans:
     if OBSTACLE_POSES in plans.columns:
         raise UsageError("the plans have scenes of their own", concerns="scenes")
     count = len(plans)
+    options = ReadingOptions(allow_unused)
     placed, rows = _placed(
-        as_problem(plans.problem), scenes, counted(count, "plan"), count, ()
+        as_problem(plans.problem), scenes, counted(count, "plan"), count, options
     )
     return replace(
         plans,
@@ -134,19 +142,20 @@ def _placed(
     scenes: str | Path | Sequence[SceneProblem],
     motions: str,
     count: int,
-    allow_unused: Sequence[str],
+    options: ReadingOptions,
 ) -> tuple[Problem, Array]:
     """Return the problem with the obstacles of scenes, and their poses around each of some motions, (count, width)."""
-    if not isinstance(scenes, str | Path):
-        check_scenes(scenes)
-        placed, poses = _of_problems(problem, scenes)
-    elif file_kind(Path(scenes)) == PLANS:
-        placed, poses = _of_plans(problem, Path(scenes))
-    else:
-        options = ReadingOptions(allow_unused)
+    if isinstance(scenes, str | Path) and file_kind(Path(scenes)) != PLANS:
         placed, poses = _of_problems(
             problem, read_scenes(Path(scenes), options=options)
         )
+    else:
+        check_allowed(options.allow_unused, [])
+        if isinstance(scenes, str | Path):
+            placed, poses = _of_plans(problem, Path(scenes))
+        else:
+            check_scenes(scenes)
+            placed, poses = _of_problems(problem, scenes)
     if len(poses) not in {1, count}:
         raise UsageError(
             f"must have one scene, or one for each of {motions}, got {len(poses)}",

@@ -65,6 +65,8 @@ def read_trajectory_tables(
             f"{path} is not there, expected a file of trajectories or a folder of them"
         )
     suffix = path.suffix.lower()
+    if options.separator is not None and suffix in _READERS.keys() - {*TEXT_SUFFIXES}:
+        raise UsageError(f"is for text files, got {path}", argument="separator")
     read = _READERS.get(suffix)
     if read is None:
         raise UsageError(

@@ -19,11 +19,13 @@ class ReadingOptions:
         allow_unused: Keys of elements that are accepted without effect.
         packages: Folders with packages of mesh files.
         present: Joint -> position [rad], the present state of the robot.
+        allowed_elsewhere: Further such keys, which the scenes may lack.
     """
 
     allow_unused: Sequence[str] = ()
     packages: Sequence[Path] = ()
     present: Mapping[str, float] = field(default_factory=dict)
+    allowed_elsewhere: Sequence[str] = ()
 
 
 DEFAULT_OPTIONS = ReadingOptions()

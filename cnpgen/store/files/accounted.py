@@ -9,7 +9,7 @@ error for every other element, with its path and the nearest known name.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
 from typing import Any
@@ -67,6 +67,8 @@ class Account:
         self._allowed = tuple(allow_unused)
         self.unused: list[str] = []
         self.accepted: list[str] = []
+        # Of all mappings, for suggestions.
+        self.keys: set[str] = set()
 
     def refuse(self, path: str, value: object, text: str) -> None:
         """Raise an error for an element that the reader does not honour, unless its loss is accepted."""
@@ -108,6 +110,30 @@ class Account:
             )
 
 
+def unmatched(keys: Sequence[str], paths: Sequence[str]) -> list[str]:
+    """Return the keys that name none of some elements."""
+    return [key for key in keys if not any(_matches(path, [key]) for path in paths)]
+
+
+def check_allowed(
+    keys: Sequence[str], unused: Sequence[str], known: Iterable[str] = ()
+) -> None:
+    """Raise UsageError if the loss of an element is accepted that no document has, or that is used.
+
+    Args:
+        keys: Keys or ends of paths of elements whose loss the caller accepts.
+        unused: Paths of the unused elements of all documents.
+        known: Keys of the documents, for suggestions.
+    """
+    for key in unmatched(keys, unused):
+        names = sorted({*known, *unused})
+        hint = " that is refused" if key in names else nearest(key, names)
+        raise UsageError(
+            f"must name a refused or unknown element of the input, which has no {key!r}{hint}",
+            argument=ALLOW_UNUSED,
+        )
+
+
 def misspelt(*documents: AccountedMapping) -> str:
     """Describe the elements not read so far whose names are near one that is missing beside them; empty without any.
 
@@ -127,6 +153,7 @@ class AccountedMapping(dict[str, Any]):
             for key, value in values.items()
         )
         self.path, self.account = path, account
+        account.keys.update(self)
         # Also keys that the mapping lacks.
         self._read: set[str] = set()
         # Keys whose presence was checked.

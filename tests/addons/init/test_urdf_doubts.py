@@ -15,6 +15,7 @@ from cnpgen.errors import RecipeError, UsageError
 from cnpgen.problems.load_robot import load_robot
 from cnpgen.robots.robot import Robot
 from cnpgen.robots.urdf import urdf_tree
+from cnpgen.robots.urdf_changes import SRDF_NAMES
 from cnpgen.robots.urdf_elements import _KNOWN, check_elements, unread_elements
 
 BOX = '<geometry><box size="0.4 0.08 0.08"/></geometry>'
@@ -370,6 +371,24 @@ def test_misspelt_elements_of_a_urdf_are_refused(
     path = write(tmp_path / "a.urdf", **changes)
     with pytest.raises(RecipeError, match=re.escape(text)):
         initial(path)
+
+
+def test_the_loss_of_a_misspelt_element_is_accepted_by_name_and_recorded(
+    tmp_path: Path,
+) -> None:
+    upper = UPPER + SHAPE.replace("collision", "colision") + SHAPE
+    path = write(tmp_path / "a.urdf", upper=upper)
+    found = initial(path, allow_unused=("colision",))
+    assert found.problem.robot.allow_unused == ("colision",)
+    assert "<colision> in <link> is not read, 1 time" in "".join(found.notes)
+    with pytest.raises(UsageError, match=r"has no 'colison' \(did you mean 'colision'"):
+        initial(path, allow_unused=("colision", "colison"))
+    srdf = tmp_path / "a.srdf"
+    srdf.write_text("<robot name='a'><disable_collision link1='a'/></robot>")
+    tree = urdf_tree(srdf.read_text())
+    with pytest.raises(RecipeError, match="did you mean 'disable_collisions'"):
+        check_elements(tree, srdf, SRDF_NAMES)
+    check_elements(tree, srdf, SRDF_NAMES, allow_unused=["disable_collision"])
 
 
 def test_a_name_beside_the_one_that_it_resembles_is_not_misspelt() -> None:

@@ -509,7 +509,13 @@ def test_options_that_disable_a_check_are_refused(wrong):
 @pytest.mark.parametrize("wrong", [1e308, True, -1.0], ids=str)
 def test_times_to_rest_that_disable_the_check_are_refused(wrong):
     with pytest.raises(UsageError, match="stop_after"):
-        ChunkExecutor("panda-3kg", **OPTIONS, options=ChunkOptions(stop_after=wrong))
+        ChunkOptions(stop_after=wrong)
+
+
+@pytest.mark.parametrize("wrong", [-1.0, 0.0, np.inf, np.nan], ids=str)
+def test_noise_that_disables_a_check_is_refused(wrong):
+    with pytest.raises(UsageError, match="noise"):
+        ChunkOptions(noise=wrong)
 
 
 def test_future_set_points_are_those_that_are_served_later():

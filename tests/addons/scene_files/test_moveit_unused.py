@@ -171,6 +171,49 @@ def test_every_element_of_the_messages_is_used_refused_or_listed(root: str) -> N
     assert min(counts["refused"], counts["used"], counts["listed"]) > 10
 
 
+def pairs_of(count: int, *, seed: int) -> Iterator[list[tuple[Place, Any]]]:
+    """Yield pairs of changes: of two fields of one message, or of a field and one in it."""
+    random = np.random.default_rng(seed)
+    groups: dict[Place, list[tuple[Place, str]]] = {}
+    for place, kind in ALL_FIELDS:
+        # Fields of a message, and those of the messages in it.
+        for depth in range(len(place)):
+            if len(place) - depth <= 4:
+                groups.setdefault(place[:depth], []).append((place, kind))
+    several = [group for group in groups.values() if len(group) > 1]
+    for _ in range(count):
+        group = several[random.integers(len(several))]
+        chosen = random.choice(len(group), 2, replace=False)
+        pair = [group[index] for index in sorted(chosen)]
+        values = [VALUES.get(kind, [{}]) for _, kind in pair]
+        yield [
+            (place, options[random.integers(len(options))])
+            for (place, _), options in zip(pair, values, strict=True)
+        ]
+
+
+@pytest.mark.parametrize(
+    ("root", "count"),
+    [("plain", 300), pytest.param("rich", 1000, marks=pytest.mark.slow)],
+)
+def test_one_of_two_changes_does_not_hide_the_other(root: str, count: int) -> None:
+    content = document() if root == "rich" else minimal()
+    usual = digest(read(content)[0])
+    fates, lost = set(), []
+    for (first, one), (second, other) in pairs_of(count, seed=4):
+        alone = [
+            outcome(content, first, one, usual),
+            outcome(content, second, other, usual),
+        ]
+        both = outcome(changed(content, first, one), second, other, usual)
+        fates.add(both)
+        # Two wrong elements may be right together, in a part that is listed.
+        if {"used", "refused"} & {*alone} and both in {"lost", "without effect"}:
+            lost.append(f"{plain(first)} = {one!r}, {plain(second)} = {other!r}")
+    assert fates >= ({"refused"} if root == "plain" else {"used", "refused"})
+    assert not lost
+
+
 def minimal() -> dict[str, Any]:
     goal = {"joint_constraints": [{"joint_name": "a", "position": 0.5}]}
     state = {"joint_state": {"name": ["a", "b"], "position": [0.1, 0.2]}}
@@ -183,7 +226,8 @@ def test_a_misspelt_key_is_refused_with_the_nearest_name_at_every_place() -> Non
     for place, _ in ALL_FIELDS:
         if not isinstance(place[-1], str) or value_at(content, place) is None:
             continue
-        if is_listed(place[:-1]):
+        # Pairs of the matrix are used, others in it are listed.
+        if is_listed(place[:-1]) and place[0] != "allowed_collision_matrix":
             continue
         wrong = changed(content, (*place[:-1], f"{place[-1]}q"), "elsewhere")
         with pytest.raises(UsageError, match=rf"unknown element.*{place[-1]}q"):
@@ -302,12 +346,12 @@ def test_an_entry_of_the_tables_does_not_change_the_problem(entry: str) -> None:
         assert entry.lstrip(".") in " ".join(usual[1].unused)
 
 
-def test_the_docs_print_the_tables() -> None:
+def test_the_docs_print_the_lists() -> None:
     page = Path(__file__).parents[3] / "docs" / "how-to" / "scene-files.md"
     text = page.read_text(encoding="utf-8")
     for table in (HARMLESS, UNUSED):
         for key, reason in table.items():
-            assert f"| `{key.lstrip('.')}` | {reason} |" in text
+            assert f"- `{key.lstrip('.')}`: {reason}\n" in text
 
 
 @pytest.mark.parametrize(
@@ -427,6 +471,29 @@ def test_a_start_state_without_a_goal_is_refused(tmp_path: Path) -> None:
         load_scenes(tmp_path)
 
 
+@pytest.mark.parametrize(
+    ("key", "text"),
+    [
+        ("max_cartesian_sped", r"has no 'max_cartesian_sped' \(did you mean"),
+        ("group_nam", r"has no 'group_nam' \(did you mean 'group_name'\?\)"),
+        ("world", "has no 'world' that is refused"),
+        ("max_velocity_scaling_factor", "has no 'max_velocity_scaling_factor'"),
+    ],
+)
+def test_a_key_that_no_scene_needs_is_refused(
+    tmp_path: Path, key: str, text: str
+) -> None:
+    content = minimal() | {"group_name": "arm", "max_cartesian_speed": 0.1}
+    file = write(tmp_path, a=content) / "a.yaml"
+    allowed = ["max_cartesian_speed", key]
+    with pytest.raises(UsageError, match=f"allow_unused must name .*{text}"):
+        load_scenes(file, allow_unused=allowed)
+    (scene,) = load_scenes(file, allow_unused=allowed[:1], allowed_elsewhere=[key])
+    # An element that is only listed needs no acceptance, and may have it.
+    load_scenes(file, allow_unused=["max_cartesian_speed", "group_name"])
+    assert scene.request.accepted == ("max_cartesian_speed",)
+
+
 def test_files_of_a_folder_without_scenes_are_named(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
@@ -476,3 +543,17 @@ def test_options_that_no_scene_needs_are_named(
 def test_a_weight_that_is_no_weight_is_refused(place: Place, weight: Any) -> None:
     with pytest.raises(UsageError, match="weight must be"):
         read(changed(document(), (*place, 0, "weight"), weight))
+
+
+def test_frames_that_are_given_twice_are_refused() -> None:
+    place = {"translation": [0, 0, 1], "rotation": [0, 0, 0, 1]}
+    frame = {"child_frame_id": "camera", "transform": place}
+    with pytest.raises(UsageError, match="has the frame 'camera' twice"):
+        read(minimal() | {"fixed_frame_transforms": [frame, frame]})
+    twice = changed(
+        document(), ("world", "collision_objects", 0, "subframe_names"), ["a", "a"]
+    )
+    first = ("world", "collision_objects", 0, "subframe_poses")
+    poses = value_at(document(), first) * 2
+    with pytest.raises(UsageError, match="has the subframe 'a' twice"):
+        read(changed(twice, first, poses))

@@ -155,3 +155,11 @@ def test_damaged_octomaps_are_refused(
 
 def test_an_octomap_without_data_is_none(tmp_path: Path) -> None:
     assert not scene_with(tmp_path, {"data": []}).obstacles
+
+
+@pytest.mark.parametrize("key", ["dat", "occupancy"])
+def test_an_unknown_key_of_an_octomap_without_data_is_refused(
+    tmp_path: Path, key: str
+) -> None:
+    with pytest.raises(SceneError, match=rf"unknown element, .*octomap\.{key}"):
+        scene_with(tmp_path, {"data": [], key: [1]})

@@ -131,6 +131,28 @@ JSON_CHANGES: list[tuple[str, Any, Callable[[Any], Any], str]] = [
         "refused",
     ),
     (
+        "base, points misspelt",
+        RESULT,
+        lambda m: m["planned_trajectory"]["multi_dof_joint_trajectory"].update(
+            pionts=[{}]
+        ),
+        "refused",
+    ),
+    (
+        "base, placed",
+        RESULT,
+        lambda m: m["trajectory_start"].update(
+            multi_dof_joint_state={"joint_names": ["world"]}
+        ),
+        "listed",
+    ),
+    (
+        "two times",
+        MESSAGE,
+        lambda m: m["points"][5]["time_from_start"].update(secs=1),
+        "refused",
+    ),
+    (
         "tolerance",
         GOAL,
         lambda m: m["goal"].update(path_tolerance=[{"name": "a"}]),
@@ -264,3 +286,15 @@ def test_the_json_of_a_verdict_names_what_was_not_used(
     words = ["evaluate", str(path), "--problem", "airhockey", "--json"]
     assert main([*words, "--allow-unused", "velocity_scaling"]) in {0, 1}
     assert "velocity_scaling" in json.loads(capsys.readouterr().out)["unused"]
+
+
+def test_options_that_nothing_needs_are_refused(tmp_path: Path) -> None:
+    file = tmp_path / "a.json"
+    file.write_text(json.dumps(MESSAGE))
+    for options, text in (
+        ({"allow_unused": ("velocity_scaling",)}, "has no 'velocity_scaling'"),
+        ({"separator": ";"}, "separator is for text files"),
+        ({"topic": "/a"}, "topic is for bags"),
+    ):
+        with pytest.raises(UsageError, match=text):
+            load_trajectories(file, "airhockey", options=LoadOptions(**options))

@@ -203,6 +203,22 @@ def test_a_step_that_a_late_frame_explains_is_for_review(
     assert found["episodes"][0]["result"] == "EXCLUDE"  # by a stated jitter
 
 
+def test_a_fast_part_of_many_frames_is_for_review_with_nominal_times(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    q = np.zeros((180, 5))
+    # 6 rad/s for half a second: within the limit of 4.7 if every second frame is late.
+    q[:, 2] = 6.0 * np.clip(np.arange(180) / FPS - 2.0, 0, 0.5)
+    folder = write_lerobot(tmp_path / "set", [q])
+    code, found = check(capsys, folder, "--unit", "rad")
+    assert code == 0
+    (finding,) = [
+        each for each in found["episodes"][0]["findings"] if each["check"] == "velocity"
+    ]
+    assert finding["level"] == "REVIEW"
+    assert finding["joint"] == "elbow_flex"
+
+
 def test_actions_never_exclude_for_their_derivatives(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -386,3 +402,49 @@ def test_all_common_arms_are_known_and_limit_velocities(name: str) -> None:
     # Outside, a unit was mistaken.
     assert (limit.upper > 1.2).all()
     assert (limit.upper < 7).all()
+
+
+@pytest.mark.parametrize(
+    ("options", "text"),
+    [
+        (["--unit", "deg"], "--unit is for columns without a unit"),
+        (["--rate", "10"], "--rate is for data without times"),
+        (["--key", "q"], "--key is for HDF5 files"),
+        (["--calibration", "a.json", "--unit", "deg"], "--unit is not for values"),
+    ],
+)
+def test_names_and_units_in_the_heads_of_tables_are_read(
+    tmp_path: Path, options: list[str], text: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    t = np.linspace(0, 2, 201)
+    q = np.rad2deg(0.2 * np.sin(t)[:, None] + np.array([0, 0, 0, -2, 0, 2, 0.8]))
+    head = ["t [ms]", *(f"q panda_joint{k} [deg]" for k in range(1, 8))]
+    rows = np.column_stack([1e3 * t, q, np.full_like(q, 9)])
+    head += [f"dq panda_joint{k} [deg/s]" for k in range(1, 8)]
+    folder = tmp_path / "csv"
+    folder.mkdir()
+    lines = [",".join(map(repr, row)) for row in rows.tolist()]
+    (folder / "a.csv").write_text("\n".join([",".join(head), *lines]))
+    words = ["check-episodes", str(folder), "--arm", "panda"]
+    assert main(words) == 0
+    assert "1 PASS, 0 REVIEW, 0 EXCLUDE" in capsys.readouterr().out
+    assert main([*words, *options]) == 2
+    assert text in capsys.readouterr().err
+    (folder / "a.csv").write_text(
+        "\n".join([",".join(head).replace("deg", "rad"), *lines])
+    )
+    main(words)
+    assert "joint4: at most -115 rad" in capsys.readouterr().out
+    (folder / "a.csv").write_text(
+        "\n".join([",".join(head).replace("[deg]", "[furlong]"), *lines])
+    )
+    assert main(words) == 2
+    assert "unknown unit" in capsys.readouterr().err
+
+
+def test_options_of_an_arm_need_one(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "a.csv").write_text("t,a\n0,0\n1,0\n2,0\n")
+    assert main(["check-episodes", str(tmp_path), "--joints", "a"]) == 2
+    assert "--joints needs --arm" in capsys.readouterr().err

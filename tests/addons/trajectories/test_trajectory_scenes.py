@@ -147,7 +147,7 @@ def test_the_scenes_of_a_dataset_of_lerobot_add_their_obstacles_to_a_problem(
     for option in ("--scenes", "--topic"):
         given = [option, str(files[0]), option, str(files[1])]
         assert main([*words, *given]) == 2
-        assert f"{option}: names one input, got " in capsys.readouterr().err
+        assert f"{option}: given twice, " in capsys.readouterr().err
 
 
 def test_export_takes_scenes_for_plans_without(
