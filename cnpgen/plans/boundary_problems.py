@@ -382,7 +382,8 @@ def _of_file(
             problem, columns, source=f"boundary conditions in {path.name}"
         )
     except UsageError as error:
-        text = f"{path}: {error.args[0]}"
+        field = f"{error.argument} " if error.is_predicate else ""
+        text = f"{path}: {field}{error.args[0]}"
         raise DatasetError(text, remedies=error.remedies) from error
     return replace(plans, has_checksum=file.has_checksum)
 

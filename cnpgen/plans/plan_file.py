@@ -107,7 +107,8 @@ def load_plans(
     try:
         plans = _assembled(path, record, columns, attributes)
     except UsageError as error:
-        text = f"{path}: {error.args[0]}"
+        field = f"{error.argument} " if error.is_predicate else ""
+        text = f"{path}: {field}{error.args[0]}"
         raise DatasetError(text, remedies=error.remedies) from error
     return correct_tips(replace(plans, has_checksum=has_checksum), where=f"{path}: ")
 

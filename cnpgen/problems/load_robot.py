@@ -7,6 +7,7 @@ import numpy as np
 
 from cnpgen.arrays import Array
 from cnpgen.errors import RecipeError
+from cnpgen.machine.threads import one_thread
 from cnpgen.problems.constraints.joint import JointTorque
 from cnpgen.problems.constraints.link_clearance import ObjectClearance
 from cnpgen.problems.constraints.table import Table
@@ -93,7 +94,10 @@ def _with_shapes(problem: Problem, robot: Robot) -> Robot:
     with recipe_errors_in(problem.path):
         model, shape = robot.model, None
         if problem.robot.geometry == "urdf":
-            shape = load_shape(robot.urdf_text, model, kept_folder())
+            # Sums of matrix products, and so the last digits of capsules, would depend
+            # on the number of threads.
+            with one_thread():
+                shape = load_shape(robot.urdf_text, model, kept_folder())
         held = _held_shape(problem, robot)
     # The model is expensive to build again.
     robot = replace(robot, shape=shape, held_shape=held, built_model=model)
@@ -218,9 +222,10 @@ def _held_shape(problem: Problem, robot: Robot) -> Shape | None:
     """Load the geometry for collisions of the held object with the robot, if a constraint needs it."""
     if problem.object is None or problem.first(ObjectClearance) is None:
         return None
-    return load_held_shape(
-        robot.urdf_text, robot.model, problem.object, robot.tip_frame, kept_folder()
-    )
+    with one_thread():  # as of the robot's own shape
+        return load_held_shape(
+            robot.urdf_text, robot.model, problem.object, robot.tip_frame, kept_folder()
+        )
 
 
 def _errors(problem: Problem, robot: Robot) -> Iterator[str]:

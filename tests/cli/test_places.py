@@ -111,9 +111,7 @@ def test_a_file_of_plans_is_not_a_recipe(
     )
 
 
-@pytest.mark.parametrize(
-    "words", [("show", "{}"), ("make-dataset", "{}"), ("solve", "{}", "--n", "1")]
-)
+@pytest.mark.parametrize("words", [("make-dataset", "{}"), ("solve", "{}", "--n", "1")])
 def test_a_model_is_not_a_recipe(
     said: Said, words: tuple[str, ...], tmp_path: Path
 ) -> None:

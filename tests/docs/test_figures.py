@@ -18,8 +18,8 @@ NOT_QUOTED = {
     "refiner_problems",
 }
 NOT_QUOTED |= {"ipopt", "slsqp"}  # parts of benchmarks/refiner.py
-# Parts of benchmarks/chunks.py and benchmarks/drives.py.
-NOT_QUOTED |= {"chunk_baselines", "chunk_loop", "drive_plant"}
+# Parts of benchmarks/chunks.py, drives.py and episodes.py.
+NOT_QUOTED |= {"chunk_baselines", "chunk_loop", "drive_plant", "episode_programs"}
 
 
 @pytest.fixture

@@ -25,6 +25,7 @@ WITHOUT_EFFECT = {
     "cnpgen.errors": "the words of exceptions",
     "cnpgen.schema": "how recipes are read: what was read is in the problem's identity",
     "cnpgen.machine.versions": "the processor, which is in no tape",
+    "cnpgen.machine.threads": "how many threads sum, which is in no tape",
     "cnpgen.world": "what Pinocchio and Coal measure, which is in no tape",
     "cnpgen.store": "how columns are described and files are written",
 }

@@ -200,7 +200,7 @@ def test_invalid_scenes_are_refused(
     edit(damaged, "train/shard-00000.h5", overwrite)
     with pytest.raises(DatasetError, match=message):
         cnpgen.load_dataset(damaged).rows("train", [0], fields=["obstacle_poses"])
-    assert main(["validate", str(damaged), "--workers", "1"]) == 1
+    assert main(["validate", str(damaged)]) == 1
 
 
 def test_ends_are_clear_of_their_scene_by_coal(dataset: Path) -> None:

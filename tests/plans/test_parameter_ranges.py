@@ -28,7 +28,7 @@ def plans_with(parameters: list[float]) -> Plans:
 
 
 def test_completed_tasks_name_the_parameter_and_its_range() -> None:
-    with pytest.raises(UsageError, match=f"parameters {OUTSIDE}"):
+    with pytest.raises(UsageError, match=f"{OUTSIDE}; extrapolate=True"):
         cnpgen.complete(
             "airhockey-tables",
             goal_xyz=[[1, 0.1]],

@@ -461,7 +461,7 @@ def test_invalid_plans_are_listed_and_the_exit_code_is_1(
         (["solve", "airhockey-hit"], "--n is required"),
         (
             ["solve", "airhockey-hit", "--n", "2", "--split", "train"],
-            "--split and --first need the folder",
+            "--split needs the folder",
         ),
         (["solve", "airhokey-hit", "--n", "2"], "did you mean 'airhockey-hit'"),
         (["refine", "nowhere.h5"], "nowhere.h5"),

@@ -14,7 +14,6 @@ import numpy as np
 
 from cnpgen.arrays import Array
 from cnpgen.errors import RecipeError, nearest
-from cnpgen.machine.threads import one_thread
 from cnpgen.robots.chain import Chain, frame_of
 from cnpgen.robots.robot_spec import HeldObject
 from cnpgen.robots.shape.capsule import Capsule, covering_capsule, covers
@@ -155,10 +154,7 @@ def _cached(
                 # The cache is not trusted: capsules must cover the parts, or they are
                 # computed again.
                 return _read(json.loads(entry), convex_parts)
-    # Sums of matrix products, and so the last digits, would depend on the number of
-    # threads.
-    with one_thread():
-        capsules, pairs = compute()
+    capsules, pairs = compute()
     if keep is not None:
         write_entry(keep / name, json.dumps(_written(capsules, pairs)).encode())
     return capsules, pairs

@@ -125,6 +125,9 @@ def check_allowed(
         unused: Paths of the unused elements of all documents.
         known: Keys of the documents, for suggestions.
     """
+    for key in keys:
+        if not isinstance(key, str):
+            raise UsageError(f"must hold names, got {key!r}", argument=ALLOW_UNUSED)
     for key in unmatched(keys, unused):
         names = sorted({*known, *unused})
         hint = " that is refused" if key in names else nearest(key, names)
