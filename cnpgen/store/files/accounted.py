@@ -126,6 +126,8 @@ def check_allowed(
         known: Keys of the documents, for suggestions.
     """
     for key in unmatched(keys, unused):
+        if not isinstance(key, str):
+            raise UsageError(f"must be names, got {key!r}", argument=ALLOW_UNUSED)
         names = sorted({*known, *unused})
         hint = " that is refused" if key in names else nearest(key, names)
         raise UsageError(
