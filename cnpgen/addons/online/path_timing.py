@@ -155,7 +155,10 @@ def path_limits(
     # At least three nodes, also for a short remainder of the motion.
     times = np.linspace(first, last, max(3, int((last - first) / NODE_STEP_S) + 2))
     kinks = _kinks(motion)
-    times = np.union1d(times, kinks[(first < kinks) & (kinks < last)])
+    # Between kinks, velocities are parabolas of large curvature: more nodes are needed.
+    parts = np.linspace(kinks[:-1], kinks[1:], 5).ravel()
+    nodes = np.append(parts, kinks)
+    times = np.union1d(times, nodes[(first < nodes) & (nodes < last)])
     # At its end a sampled motion is at rest: the state before is that of its last cell.
     states = motion.at(np.minimum(times, np.nextafter(motion.end_time, -np.inf)))
     terms = []
