@@ -39,6 +39,7 @@ from cnpgen.world.drive import friction_bounds
 RAMPS = (0.1, 0.25, 0.45, 0.7)  # shares of the braking time in which w rises or falls
 NODE_STEP_S = 2e-3  # of the states at which limits are evaluated
 PHASES_OF_LAW = 41  # at which a time law is compared with the limits
+PHASES_OF_INVERSE = 1001  # of a table from which times at places of a law follow
 TIMING_ROUNDING = 1e-9  # of times [s], and relative of limits
 MAX_BRAKING_USE = 0.999  # of the limits: states between the phases differ a little
 
@@ -83,14 +84,20 @@ class PathLimits:
         Starts and durations [s] have shape (N,), shapes are indices of ``shape_table``.
         """
         speed, brake, travel = (table[shapes] for table in shape_table())
-        # Place on the path that each law has reached at its phases.
+        # The tables have w times the duration.
         sigma = start[:, None] + duration[:, None] * travel
+        return self.within(sigma, speed, brake / duration[:, None])
+
+    def within(self, sigma: Array, speed: Array, brake: Array) -> NDArray[np.bool_]:
+        """Return which of N time laws are within the limits at K places on the path sigma [s], shape (N,).
+
+        The speed u and w [1/s] at these places have shape (N, K).
+        """
         node = np.searchsorted(self.times, sigma, side="right") - 1
         node = np.clip(node, 0, len(self.times) - 2)
         width = self.times[node + 1] - self.times[node]
         share = np.clip((sigma - self.times[node]) / width, 0.0, 1.0)[..., None]
-        # The tables have w times the duration.
-        u2, w = (speed**2)[..., None], (brake / duration[:, None])[..., None]
+        u2, w = (speed**2)[..., None], brake[..., None]
         # The value is linear in each of the tables, so the two nodes are compared.
         low, high = (
             np.abs(self.rest[k] + self.square[k] * u2 - self.brake_factor[k] * w)
@@ -148,7 +155,10 @@ def path_limits(
     # At least three nodes, also for a short remainder of the motion.
     times = np.linspace(first, last, max(3, int((last - first) / NODE_STEP_S) + 2))
     kinks = _kinks(motion)
-    times = np.union1d(times, kinks[(first < kinks) & (kinks < last)])
+    # Between kinks, velocities are parabolas of large curvature: more nodes are needed.
+    parts = np.linspace(kinks[:-1], kinks[1:], 5).ravel()
+    nodes = np.append(parts, kinks)
+    times = np.union1d(times, nodes[(first < nodes) & (nodes < last)])
     # At its end a sampled motion is at rest: the state before is that of its last cell.
     states = motion.at(np.minimum(times, np.nextafter(motion.end_time, -np.inf)))
     terms = []
@@ -166,9 +176,11 @@ def path_limits(
 
 
 def _kinks(motion: SampledMotion) -> Array:
-    """Return the edges between cells of unequal widths [s]: only there may an acceleration have a kink."""
-    change = np.abs(np.diff(np.diff(motion.edges)))
-    return motion.edges[1:-1][change > TIMING_ROUNDING]
+    """Return the edges [s] at which an acceleration may have a kink: of slowed cells, and between unequal widths."""
+    width = np.diff(motion.edges)
+    slowed = np.abs(np.diff(motion.plan_times) - width) > TIMING_ROUNDING
+    unequal = np.abs(np.diff(width)) > TIMING_ROUNDING
+    return motion.edges[1:-1][slowed[:-1] | slowed[1:] | unequal]
 
 
 def _terms(
@@ -215,12 +227,34 @@ def _acceleration_factor(part: Plans, robot: Robot) -> float:
     )
 
 
-def _law_grid(law: TimeLaw) -> Array:
-    """Return the edges of cells from 0 to the duration of a time law [s]; w has no kink within a cell."""
+def _law_grid(motion: SampledMotion, law: TimeLaw) -> Array:
+    """Return the edges of cells from 0 to the duration of a time law along a motion [s].
+
+    No cell has a kink of w or of the motion's acceleration: a polynomial over it would
+    exceed both of its ends.
+    """
     rise, fall = law.duration * law.rise, law.duration * law.fall
-    # A polynomial over a kink of the acceleration would exceed both of its ends.
     ramp, level = grid(rise), rise + grid(law.duration - rise - fall)
-    return np.concatenate([ramp[:-1], level[:-1], law.duration - grid(fall)[::-1]])
+    times = np.concatenate([ramp[:-1], level[:-1], law.duration - grid(fall)[::-1]])
+    places = (_kinks(motion) - law.start) / law.duration
+    # The times at which the law passes the kinks: the inverse of a table of the places.
+    phases = np.linspace(0.0, 1.0, PHASES_OF_INVERSE)
+    travel = shape_at(phases, law.rise, law.fall)[2]
+    inside = places[(places > 0.0) & (places < travel[-1])]
+    passed = law.duration * np.interp(inside, travel, phases)
+    times = np.union1d(times, passed)
+    # Cells of no width, by rounding, have no polynomial.
+    kept = np.diff(times, append=np.inf) > TIMING_ROUNDING
+    return np.append(times[:-1][kept[:-1]], law.duration)
+
+
+def keeps_limits(limits: PathLimits, motion: SampledMotion, law: TimeLaw) -> bool:
+    """Return whether a time law along a motion is within the limits at the edges and in the middle of its cells."""
+    times = _law_grid(motion, law)
+    times = np.sort(np.append(times, times[:-1] + np.diff(times) / 2))
+    u, brake, travel = shape_at(times / law.duration, law.rise, law.fall)
+    sigma = law.start + law.duration * travel
+    return bool(limits.within(sigma[None], u[None], brake[None] / law.duration)[0])
 
 
 def retimed(motion: SampledMotion, law: TimeLaw) -> SampledMotion:
@@ -229,7 +263,7 @@ def retimed(motion: SampledMotion, law: TimeLaw) -> SampledMotion:
     Before the law begins, it is the given motion.
     """
     assert motion.plan is not None
-    times = _law_grid(law)
+    times = _law_grid(motion, law)
     u, brake, travel = shape_at(times / law.duration, law.rise, law.fall)
     sigma = law.start + law.duration * travel
     # A law may end where the path ends.

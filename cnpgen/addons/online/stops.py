@@ -10,6 +10,7 @@ from cnpgen.addons.online.motion_check import MotionChecker
 from cnpgen.addons.online.path_timing import (
     PathLimits,
     TimeLaw,
+    keeps_limits,
     path_limits,
     retimed,
     shape_table,
@@ -45,6 +46,9 @@ def earliest_stop(
     limits = path_limits(checker, motion, time, time + horizon)
     best = _earliest_law(limits, time, horizon)
     for law in [] if best is None else _slower(best, time + left):
+        # Between the phases that were compared, the motion may have a kink.
+        if not keeps_limits(limits, motion, law):
+            continue
         stop = retimed(motion, law)
         if not measured or not checker.violation(stop, time, law.end):
             return stop

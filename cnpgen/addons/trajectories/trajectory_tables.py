@@ -26,7 +26,11 @@ from cnpgen.store.files.atomic import machine_error, read_file
 from cnpgen.store.files.documents import parse_json
 from cnpgen.store.files.hdf5 import open_hdf5
 from cnpgen.store.files.kind import HDF5_SUFFIXES, is_hdf5, kind_of_content
-from cnpgen.store.files.size_limits import MAX_TABLE_BYTES, MAX_TEXT_TABLE_BYTES
+from cnpgen.store.files.size_limits import (
+    MAX_JSON_PARTS,
+    MAX_TABLE_BYTES,
+    MAX_TEXT_TABLE_BYTES,
+)
 from cnpgen.store.layout import SPECIFICATION
 from cnpgen.store.paths import require_path
 
@@ -138,8 +142,15 @@ def _held_joints(path: Path) -> dict[str, float]:
 
 
 def _read_json(path: Path, options: LoadOptions) -> Iterator[TrajectoryTable]:
+    content = read_file(path, max_bytes=MAX_TEXT_TABLE_BYTES)
+    # Before they take memory; those in texts count, too.
+    if (count := content.count(b"{") + content.count(b"[")) > MAX_JSON_PARTS:
+        raise UsageError(
+            f"{path} has {count:,} lists and objects, expected at most"
+            f" {MAX_JSON_PARTS:,}: write NPZ or Parquet"
+        )
     try:
-        document = parse_json(read_file(path, max_bytes=MAX_TEXT_TABLE_BYTES).decode())
+        document = parse_json(content.decode())
     except ValueError as error:
         raise UsageError(f"{path} is not JSON: {error}") from error
     yield from tables_of_document(document, str(path), options.allow_unused)

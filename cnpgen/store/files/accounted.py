@@ -129,6 +129,8 @@ def check_allowed(
         if not isinstance(key, str):
             raise UsageError(f"must hold names, got {key!r}", argument=ALLOW_UNUSED)
     for key in unmatched(keys, unused):
+        if not isinstance(key, str):
+            raise UsageError(f"must be names, got {key!r}", argument=ALLOW_UNUSED)
         names = sorted({*known, *unused})
         hint = " that is refused" if key in names else nearest(key, names)
         raise UsageError(

@@ -17,8 +17,9 @@ MAX_ATTRIBUTE_BYTES = 1 << 24  # of an attribute; the largest ones are URDFs
 
 # tables; a laptop with 8 GB reads all of them
 MAX_TABLE_BYTES = 1 << 28  # of binary ones
-# CSV, and JSON with samples: they take up to 40 times their size while they are read.
+# CSV, and JSON with samples: they take up to 60 times their size while they are read.
 MAX_TEXT_TABLE_BYTES = 1 << 26
+MAX_JSON_PARTS = 2_000_000  # lists and objects, of up to 1.6 kB each
 MAX_TEXT_ARRAY_BYTES = 1 << 28  # of a column of texts, as wide as the longest one
 MAX_TABLE_COLUMNS = 1_000
 

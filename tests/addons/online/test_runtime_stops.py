@@ -405,9 +405,9 @@ def test_stops_of_stops_are_within_the_limits_between_samples():
     checker, random = MotionChecker(), np.random.default_rng(51)
     plans = small_arm().plans
     limit = open_problem(plans[0].problem)[1].acceleration_limit
-    for number in range(240):
+    for number in range(480):
         motion = sample_motion(plans[number % len(plans)], 0.0, step=4e-3)
-        for at in np.sort(random.uniform(0.15, 0.29, 2))[::-1].tolist():
+        for at in np.sort(random.uniform(0.0, 0.29, 3))[::-1].tolist():
             motion = earliest_stop(checker, motion, at, measured=False)
             times = np.arange(at, motion.end_time, 5e-5)
-            assert (np.abs(motion.at(times).ddq) <= 1.001 * limit).all()
+            assert (np.abs(motion.at(times).ddq) <= 1.005 * limit).all()

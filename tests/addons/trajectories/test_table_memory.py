@@ -84,3 +84,12 @@ def test_text_files_have_a_limit_that_their_cells_fit_into(
         (tmp_path / name).write_text(text, encoding="utf-8")
         with pytest.raises(UsageError, match="8"):
             read_trajectory_tables(tmp_path / name)
+
+
+def test_lists_and_objects_of_json_are_counted_before_they_are_read(
+    tmp_path: Path,
+) -> None:
+    path = tmp_path / "a.json"
+    path.write_text("[" + "[]," * 2_000_000 + "0]", encoding="utf-8")
+    with pytest.raises(UsageError, match="2,000,001 lists and objects, expected at"):
+        read_trajectory_tables(path)
