@@ -543,3 +543,17 @@ def test_options_that_no_scene_needs_are_named(
 def test_a_weight_that_is_no_weight_is_refused(place: Place, weight: Any) -> None:
     with pytest.raises(UsageError, match="weight must be"):
         read(changed(document(), (*place, 0, "weight"), weight))
+
+
+def test_frames_that_are_given_twice_are_refused() -> None:
+    place = {"translation": [0, 0, 1], "rotation": [0, 0, 0, 1]}
+    frame = {"child_frame_id": "camera", "transform": place}
+    with pytest.raises(UsageError, match="has the frame 'camera' twice"):
+        read(minimal() | {"fixed_frame_transforms": [frame, frame]})
+    twice = changed(
+        document(), ("world", "collision_objects", 0, "subframe_names"), ["a", "a"]
+    )
+    first = ("world", "collision_objects", 0, "subframe_poses")
+    poses = value_at(document(), first) * 2
+    with pytest.raises(UsageError, match="has the subframe 'a' twice"):
+        read(changed(twice, first, poses))

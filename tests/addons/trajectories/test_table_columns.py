@@ -332,3 +332,27 @@ def test_failed_responses_and_motions_of_a_base_are_refused(tmp_path: Path) -> N
     path.write_text(json.dumps(message | {"multi_dof_joint_trajectory": base}))
     with pytest.raises(UsageError, match="the base of the robot must not move"):
         loaded(path)
+
+
+@pytest.mark.parametrize("name", ["names", "joints", "joint_name", "scale", "offset"])
+def test_attributes_that_change_the_meaning_of_numbers_are_refused(
+    tmp_path: Path, name: str
+) -> None:
+    path = tmp_path / "a.h5"
+    with h5py.File(path, "w") as file:
+        file["t"], file["q"] = T, Q
+        file["q"].attrs[name] = 2.0
+        file["q"].attrs["comment"] = "harmless"
+    with pytest.raises(UsageError, match=f"'attribute {name} of q' is not used"):
+        loaded(path)
+    found = load_trajectories(
+        path, "airhockey", options=LoadOptions(allow_unused=(name,))
+    )
+    assert f"attribute {name} of q" in found.ignored
+
+
+def test_names_of_joints_beside_one_dataset_determine_the_order(tmp_path: Path) -> None:
+    with h5py.File(tmp_path / "names.h5", "w") as file:
+        file["t"], file["q"] = T, Q[:, ::-1]
+        file["q"].attrs["joint_names"] = BACKWARDS
+    assert np.array_equal(only(tmp_path / "names.h5").q, Q)
