@@ -630,7 +630,7 @@ def test_options_of_rows_are_not_taken_for_a_file(trained, tmp_path, capsys):
     ]
     code, text = failing(capsys, words)
     assert code == 2
-    assert "need the folder of a dataset" in text
+    assert "--split needs the folder of a dataset" in text
 
 
 def test_a_file_without_goals_or_of_another_problem_is_an_error(
@@ -696,7 +696,7 @@ def test_a_copied_recipe_is_planned_with_a_named_model(tmp_path, monkeypatch, ca
         ),
         (
             ["airhockey-hit", "--n", "2", "--split", "train"],
-            "--split and --first need the folder of a dataset",
+            "--split needs the folder of a dataset",
         ),
         (
             ["airhockey-pucks", "--n", "2"],

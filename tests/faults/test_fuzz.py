@@ -83,9 +83,9 @@ def test_changed_meshes_and_srdf_files_reach_their_readers(
     calls: Counter[str] = Counter()
 
     def counted(read: Any) -> Any:
-        def reading(*arguments: Any) -> Any:
+        def reading(*arguments: Any, **options: Any) -> Any:
             calls[read.__name__] += 1
-            return read(*arguments)
+            return read(*arguments, **options)
 
         return reading
 
