@@ -1,10 +1,11 @@
 """Checks of recorded episodes: healthy ones that are excluded, planted faults that are found, and CPU time.
 
-    python benchmarks/episodes.py [--episodes 1000] [--json]
+    python benchmarks/episodes.py [--episodes 1000] [--programs 2000] [--json]
 
 Episodes of an SO-101 have 10 s at 30 Hz with nominal times, smooth motions of at most
 1.5 rad/s, 4,096 steps a turn and backlash of half a degree on either side. Every third
-one has a fault.
+one has a fault. Faults of random sizes in further episodes count if a linear program
+proves that a limit is exceeded by 1 % (``episode_programs``).
 """
 
 import argparse
@@ -14,6 +15,7 @@ from typing import Any
 
 import numpy as np
 from common import arguments, progress, report, table
+from episode_programs import CLOCK_NOISE_RAD, found_faults
 
 from cnpgen.addons.trajectories.arm_registry import find_arm
 from cnpgen.addons.trajectories.episode_checks import Level, Scale, check_episode
@@ -23,14 +25,22 @@ Array = np.ndarray[Any, np.dtype[np.float64]]
 
 FPS, SECONDS = 30, 10.0
 STEP_RAD, BACKLASH_RAD = 2 * np.pi / 4096, np.radians(0.5)
+MARGIN = 1.01  # of limits, for programs: their tolerance, and parts of spans
 FAULTS = ("outlier", "jump", "degrees", "joints swapped", "no number")
 
 
-def motion(random: np.random.Generator, joints: int) -> Array:
-    """Return measured positions at the frames [rad], shape (K, n)."""
-    t = np.arange(int(SECONDS * FPS)) / FPS
+def motion(
+    random: np.random.Generator,
+    joints: int,
+    t: Array | None = None,
+    is_smooth: bool = False,
+) -> Array:
+    """Return measured positions at the frames [rad], shape (K, n), smooth ones with noise in place of steps."""
+    t = np.arange(int(SECONDS * FPS)) / FPS if t is None else t
     rates = random.uniform(0.5, 2.0, joints)
     q = 1.05 / rates * np.sin(rates * t[:, None] + random.uniform(0, 6, joints))
+    if is_smooth:
+        return np.asarray(q + CLOCK_NOISE_RAD * random.uniform(-1, 1, q.shape))
     play = q + random.uniform(-BACKLASH_RAD, BACKLASH_RAD, q.shape)
     return np.asarray(np.round(play / STEP_RAD) * STEP_RAD)
 
@@ -76,6 +86,8 @@ def measure(count: int) -> dict[str, Any]:
 
 def _add(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--episodes", type=int, default=1000, help="number of episodes")
+    text = "number of episodes that linear programs compare"
+    parser.add_argument("--programs", type=int, default=2000, help=text)
 
 
 def main() -> None:
@@ -87,10 +99,25 @@ def main() -> None:
         for fault, counts in found["results"].items()
     ]
     cpu = found["CPU of 1,000 episodes [s]"]
+    faults = found_faults(options.programs, MARGIN, motion)
+    found["faults by programs"] = faults
+    missed = sum(counts["missed"] for counts in faults.values())
+    total = sum(counts.total() for counts in faults.values())
+    columns = ("missed", *list(map(str, Level))[1:])
+    proven = [
+        (name, *(f"{counts[column]:,}" for column in columns))
+        for name, counts in faults.items()
+    ]
+    share = f"found: {total - missed:,} of {total:,} ({(total - missed) / total:.2%})"
     text = f"CPU of 1,000 episodes of {SECONDS:g} s at {FPS} Hz: {cpu:.1f} s"
     report(
         found,
-        [table("episodes", ("fault", *map(str, Level)), rows), text],
+        [
+            table("episodes", ("fault", *map(str, Level)), rows),
+            text,
+            table("faults by linear programs", ("", *columns), proven),
+            share,
+        ],
         as_json=options.json,
     )
 

@@ -11,9 +11,6 @@ from cnpgen.planner.plan_requests import plan_scenes as plan_scenes
 from cnpgen.plans.scene_plans import scene_plans as scene_plans
 from cnpgen.problems.scenes.observe import observe as observe
 from cnpgen.problems.scenes.observe import scene_bodies as scene_bodies
-from cnpgen.problems.scenes.point_cloud import (
-    obstacles_of_points as obstacles_of_points,
-)
 from cnpgen.problems.scenes.scene_problem import GoalPose as GoalPose
 from cnpgen.problems.scenes.scene_problem import SceneError as SceneError
 from cnpgen.problems.scenes.scene_problem import SceneProblem as SceneProblem

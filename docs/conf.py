@@ -74,6 +74,7 @@ linkcheck_retries = 2
 
 html_theme = "furo"
 html_title = f"cnpgen {__version__}"
+html_logo = "static/logo.svg"
 html_baseurl = DOCUMENTATION_URL
 html_extra_path = ["site"]  # index.html forwards to docs/index.html
 html_copy_source = False

@@ -1,10 +1,10 @@
-"""Write the output blocks of pages: what the block before them prints.
+"""Write the output blocks of pages, and the pictures that their blocks draw.
 
     python docs/outputs.py docs/tutorials/hit-a-puck.md ...
 
 An output block follows ``<!-- output -->``. It shows some lines of the output, and ``...`` for those left out. An
-empty one is filled with the whole output. ``tests/docs/test_blocks.py`` compares the lines with those that the block
-prints, without their numbers, which depend on the machine.
+empty one is filled with the whole output. A picture of a page is replaced if a block writes a file of its name.
+``tests/docs/test_blocks.py`` compares the pictures, and the lines without their numbers, which depend on the machine.
 """
 
 import re
@@ -75,7 +75,18 @@ def write_outputs(page: Path, folder: Path) -> None:
     )
 
 
+def drawn_pictures(page: Path, folder: Path) -> list[tuple[Path, Path]]:
+    """Return the pictures that the blocks of a page drew in a folder, each with its file in docs/images."""
+    links = re.findall(r"!\[[^\]]*\]\((\S+\.png)\)", page.read_text(encoding="utf-8"))
+    pairs = [(folder / Path(link).name, page.parent / link) for link in links]
+    return [(drawn, shown) for drawn, shown in pairs if drawn.is_file()]
+
+
 if __name__ == "__main__":
+    from PIL import Image
+
     for name in sys.argv[1:]:
         with tempfile.TemporaryDirectory() as scratch:
             write_outputs(Path(name), Path(scratch))
+            for drawn, shown in drawn_pictures(Path(name), Path(scratch)):
+                Image.open(drawn).convert("P", palette=Image.ADAPTIVE).save(shown)

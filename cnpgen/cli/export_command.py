@@ -23,6 +23,7 @@ from cnpgen.errors import UsageError, counted, listed
 
 if TYPE_CHECKING:
     from cnpgen.plans import Plans
+    from cnpgen.plans.export import Exported
     from cnpgen.plans.exporter import Exporter
     from cnpgen.plans.join import JoinedPlans
 
@@ -90,52 +91,38 @@ def export(
     rate = DEFAULT_RATE_HZ if arguments.rate is None else arguments.rate
     chosen, out = _chosen(plans, arguments), _place(arguments, exporter)
     target = _target(out, exporter)
+    force, to = arguments.force, arguments.to
     # The result depends on the contents of all files that are read, not on their names.
-    request = [
-        arguments.to,
-        rate,
-        chosen,
-        arguments.at,
-        [
-            content_sha256(file)
-            for file in (Path(arguments.file), *(arguments.join or ()), *sources)
-        ],
-    ]
-    if is_finished(target, request, force=arguments.force):
+    files = Path(arguments.file), *(arguments.join or ()), *sources
+    request = [to, rate, chosen, arguments.at, [content_sha256(file) for file in files]]
+    if is_finished(target, request, force=force):
         print(f"{target} is there already, of the same request", file=sys.stderr)
         print(target)
         return 0
-    exported = export_plans(
-        plans,
-        out,
-        to=arguments.to,
-        rate=rate,
-        only=chosen,
-        force=arguments.force,
-    )
+    exported = export_plans(plans, out, to=to, rate=rate, only=chosen, force=force)
+    _report(exported)
+    lacks_scene = not exporter.uses_environment
+    if lacks_scene and open_problem(plans.problem)[0].has_sample_obstacles:
+        print(f"cnpgen: note: {NO_OBSTACLES}", file=sys.stderr)
+    # A result with plans left out ends with 1 again, so it is no finished one.
+    refused = len(exported.refused)
+    if not refused:
+        record_request(target, request)
+    of_all = f" of {exported.count + refused:,}" if refused else ""
+    text = f"exported {counted(exported.count, 'plan')}{of_all} at {rate:g} Hz"
+    print(text, file=sys.stderr)
+    print(exported.files[0] if exporter.single_file else out)
+    return 1 if refused else 0
+
+
+def _report(exported: "Exported") -> None:
+    """Report plans that were left out, and exported ones that are not valid."""
     for why in exported.refused.values():
         print(f"cnpgen: left out: {why}", file=sys.stderr)
     if exported.invalid:
         which = f"plan{'s' * (len(exported.invalid) > 1)} {listed(exported.invalid, MAX_LISTED_PLANS)}"
         text = f"not valid by their status ('cnpgen evaluate' reports why): {which}"
         print(f"cnpgen: warning: {text}", file=sys.stderr)
-    if (
-        not exporter.uses_environment
-        and open_problem(plans.problem)[0].has_sample_obstacles
-    ):
-        print(f"cnpgen: note: {NO_OBSTACLES}", file=sys.stderr)
-    of_all = (
-        f" of {exported.count + len(exported.refused):,}" if exported.refused else ""
-    )
-    # A result with plans left out ends with 1 again, so it is no finished one.
-    if not exported.refused:
-        record_request(target, request)
-    print(
-        f"exported {counted(exported.count, 'plan')}{of_all} at {rate:g} Hz",
-        file=sys.stderr,
-    )
-    print(exported.files[0] if exporter.single_file else out)
-    return 1 if exported.refused else 0
 
 
 def _plans(arguments: argparse.Namespace) -> "Plans | JoinedPlans":

@@ -32,8 +32,14 @@ def is_finished(out: Path, request: object, *, force: bool) -> bool:
         force: Whether an existing result is replaced in any case.
 
     Raises:
-        UsageError: The result exists, and is of another request or of an unknown one.
+        UsageError: The result exists, and is of another request or of an unknown one;
+            or its request has no place.
     """
+    if request_file(out).is_dir():
+        raise UsageError(
+            f"{request_file(out)} is a folder, where the request of {out.name} is"
+            " to be stored: remove it"
+        )
     if force or not _is_there(out):
         return False
     document = {}

@@ -59,6 +59,20 @@ def add_options(parser: Parser) -> None:
         help="folder of the dataset; default NAME-vMAJOR here",
     )
     add_engine(parser)
+    _add_generation(parser)
+    option(
+        "--force", action="store_true", help="overwrite another dataset in the folder"
+    )
+    option(
+        "--dry-run",
+        action="store_true",
+        help="print the specification and write nothing",
+    )
+
+
+def _add_generation(parser: Parser) -> None:
+    """Add the options of how samples are made and stored."""
+    option = parser.add_argument
     text = "rows per file; default 8192 to 65536, with --certify 64 to 1024"
     option("--shard-size", metavar="R", type=values.positive, help=text)
     option(
@@ -87,14 +101,6 @@ def add_options(parser: Parser) -> None:
         "with --certify: start from the plans of this planner, a shipped one or a file"
     )
     option("--model", metavar="NAME|FILE", type=recipe_names.model, help=text)
-    option(
-        "--force", action="store_true", help="overwrite another dataset in the folder"
-    )
-    option(
-        "--dry-run",
-        action="store_true",
-        help="print the specification and write nothing",
-    )
 
 
 def run(arguments: argparse.Namespace) -> None:

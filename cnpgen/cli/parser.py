@@ -228,6 +228,17 @@ def refuse_others(arguments: argparse.Namespace, *names: str) -> None:
     refuse(arguments, others, f"{{}} has no effect with --{names[0]}")
 
 
+def add_selection(parser: Options) -> None:
+    """Add the options that select samples of a folder, or the number and the seed of fresh ones."""
+    option, selected = parser.add_argument, "first sample of the split (default: 0)"
+    option("--split", metavar="NAME", help="split of the folder (default: validation)")
+    option("--first", metavar="I", type=values.natural, help=selected)
+    text = "number of problems; for a folder by default all that follow"
+    option("--n", metavar="K", type=values.rows, help=text)
+    text = "root seed of fresh problems; default the recipe's"
+    option("--seed", metavar="S", type=values.seed, help=text)
+
+
 def add_json(parser: Parser) -> None:
     """Add ``--json``."""
     parser.add_argument("--json", action="store_true", help="write JSON")

@@ -18,8 +18,16 @@ from hashlib import sha256
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from cnpgen.cli import recipe_names, values
-from cnpgen.cli.parser import ENGINE, Parser, add_engine, add_json, options_of, refuse
+from cnpgen.cli import recipe_names
+from cnpgen.cli.parser import (
+    ENGINE,
+    Parser,
+    add_engine,
+    add_json,
+    add_selection,
+    options_of,
+    refuse,
+)
 from cnpgen.cli.refine_command import (
     ALLOW_UNUSED,
     LARGE_ANGLES,
@@ -52,25 +60,7 @@ def add_options(parser: Parser) -> None:
     option("--model", metavar="NAME|FILE", type=recipe_names.model, help=text)
     text = "plan file to write, .h5 (default for a recipe: NAME-plans.h5)"
     option("-o", "--out", metavar="PLANS", type=Path, help=text)
-    option("--split", metavar="NAME", help="split of the dataset (default: validation)")
-    option(
-        "--first",
-        metavar="I",
-        type=values.natural,
-        help="first sample of the split (default: 0)",
-    )
-    option(
-        "--n",
-        metavar="K",
-        type=values.rows,
-        help="number of problems; for a folder by default all that follow",
-    )
-    option(
-        "--seed",
-        metavar="S",
-        type=values.seed,
-        help="root seed of fresh problems; default the recipe's",
-    )
+    add_selection(parser)
     option(
         "--other-rows",
         action="store_true",
@@ -97,26 +87,18 @@ def run(arguments: argparse.Namespace) -> int:
     import json
     import time
 
-    from cnpgen.cli.finished import content_sha256, is_finished, record_request
-    from cnpgen.planner.model_file import find_model, load_model
+    from cnpgen.cli.finished import is_finished, record_request
+    from cnpgen.planner.model_file import load_model
     from cnpgen.planner.planner import Planner
     from cnpgen.plans import save_plans
 
     _complete(arguments)
     model = load_model(arguments.model)
     requests = _requests(arguments, model)
-    # What the result depends on: model, boundary conditions, further columns, options.
-    request = [
-        content_sha256(find_model(arguments.model)),
-        _checksums(requests.boundary.arrays()),
-        _checksums({**requests.columns, "sample_id": requests.sample_id}),
-        options_of(arguments, "no_time_scaling", "allow_large_angles"),
-    ]
+    request, out = _request(arguments, requests), arguments.out
     # With --refine, ``refine_and_save`` compares its own request.
-    if not arguments.refine and is_finished(
-        arguments.out, request, force=arguments.force
-    ):
-        return report_finished(arguments, arguments.out)
+    if not arguments.refine and is_finished(out, request, force=arguments.force):
+        return report_finished(arguments, out)
     planner = Planner(model, scale_time=not arguments.no_time_scaling)
     begun = time.perf_counter()
     plans = planner.plan_batch(
@@ -126,30 +108,35 @@ def run(arguments: argparse.Namespace) -> int:
         allow_large_angles=arguments.allow_large_angles,
     )
     seconds = time.perf_counter() - begun
-    if not arguments.quiet:
-        text = f"{counted(len(plans), 'plan')} in {1e3 * seconds:.1f} ms"
-        if len(plans):
-            text += f", {1e6 * seconds / len(plans):.0f} us each, mean motion time {plans.duration.mean():.3f} s"
-        print(text, file=sys.stderr)
-    if arguments.refine:
-        return refine_and_save(
-            arguments,
-            plans,
-            arguments.out,
-            title=f"refining plans of {arguments.model}",
-        )
-    save_plans(arguments.out, plans)
-    record_request(arguments.out, request)
     # No plans have no mean, which is null in JSON.
     duration = float(plans.duration.mean()) if len(plans) else None
-    facts = {
-        "file": str(arguments.out),
-        "plans": len(plans),
-        "seconds": seconds,
-        "mean_duration_s": duration,
-    }
-    print(json.dumps(facts, indent=2) if arguments.json else arguments.out)
+    if not arguments.quiet:
+        text = f"{counted(len(plans), 'plan')} in {1e3 * seconds:.1f} ms"
+        if duration is not None:
+            text += f", {1e6 * seconds / len(plans):.0f} us each, mean motion time {duration:.3f} s"
+        print(text, file=sys.stderr)
+    if arguments.refine:
+        title = f"refining plans of {arguments.model}"
+        return refine_and_save(arguments, plans, out, title=title)
+    save_plans(out, plans)
+    record_request(out, request)
+    facts = {"file": str(out), "plans": len(plans), "seconds": seconds}
+    facts |= {"mean_duration_s": duration}
+    print(json.dumps(facts, indent=2) if arguments.json else out)
     return 0
+
+
+def _request(arguments: argparse.Namespace, requests: "Requests") -> list[Any]:
+    """Return what the result depends on: model, boundary conditions, further columns, options."""
+    from cnpgen.cli.finished import content_sha256
+    from cnpgen.planner.model_file import find_model
+
+    return [
+        content_sha256(find_model(arguments.model)),
+        _checksums(requests.boundary.arrays()),
+        _checksums({**requests.columns, "sample_id": requests.sample_id}),
+        options_of(arguments, "no_time_scaling", "allow_large_angles"),
+    ]
 
 
 def _checksums(arrays: "Mapping[str, NDArray[Any]]") -> dict[str, str]:

@@ -34,6 +34,7 @@ if TYPE_CHECKING:
     from cnpgen.machine.times import Times
     from cnpgen.make.solve_scenes import SolvedScenes
     from cnpgen.plans import Plans
+    from cnpgen.refine.options import RefineOptions
     from cnpgen.refine.refinement import Refinement
 
 # What add_refining adds.
@@ -147,24 +148,15 @@ def refine_and_save(
 
     from cnpgen.cli.finished import is_finished, record_request
     from cnpgen.plans import save_plans
-    from cnpgen.refine.options import RefineOptions
     from cnpgen.refine.refine_plans import identity_of_run, refine_plans
 
-    given = options_of(arguments, *REFINING)
-    # Of ``solve`` only.
-    given["time_limit"] = getattr(arguments, "time_limit", None)
-    options = RefineOptions(
-        **{name: value for name, value in given.items() if value is not None}
-    )
+    options = _refine_options(arguments)
     if plans is not None:
         # Columns without effect on the refined motions are kept in the result.
         kept = joblib.hash([plans.columns, plans.sample_id])
         request = [identity_of_run(plans, options), kept]
-    request = [
-        request,
-        make.__name__ if make is not None and plans is not None else "",
-        options.document(),
-    ]
+    name = make.__name__ if make is not None and plans is not None else ""
+    request = [request, name, options.document()]
     if is_finished(out, request, force=arguments.force):
         return report_finished(arguments, out)
     check_place(out)
@@ -199,12 +191,21 @@ def refine_and_save(
     # The journal is removed last: until then the same command can resume from it.
     journal.unlink(missing_ok=True)
     if not arguments.quiet:
-        lines = _summary(
-            facts, found.times, listed=facts["plans"] if arguments.explain else LISTED
-        )
-        print("\n".join(lines), file=sys.stderr)
+        listed = facts["plans"] if arguments.explain else LISTED
+        print("\n".join(_summary(facts, found.times, listed=listed)), file=sys.stderr)
     print(json.dumps({"file": str(out), **facts}, indent=2) if arguments.json else out)
     return 0 if found.valid.all() else 1
+
+
+def _refine_options(arguments: argparse.Namespace) -> "RefineOptions":
+    from cnpgen.refine.options import RefineOptions
+
+    given = options_of(arguments, *REFINING)
+    # Of ``solve`` only.
+    given["time_limit"] = getattr(arguments, "time_limit", None)
+    return RefineOptions(
+        **{name: value for name, value in given.items() if value is not None}
+    )
 
 
 def report_finished(arguments: argparse.Namespace, out: Path) -> int:

@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from cnpgen.cli import recipe_names, values
-from cnpgen.cli.parser import EXTRAPOLATE, Parser, options_of, refuse
+from cnpgen.cli.parser import EXTRAPOLATE, Parser, add_selection, options_of, refuse
 from cnpgen.cli.refine_command import (
     ALLOW_UNUSED,
     LARGE_ANGLES,
@@ -32,8 +32,11 @@ from cnpgen.errors import DatasetError, UsageError, listed
 STAY_WITHIN = "{} needs the path of a plan: 'cnpgen refine', a dataset made with --certify, or --initial-plans"
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     from cnpgen.make.solve_scenes import SolvedScenes
     from cnpgen.plans import Plans
+    from cnpgen.problems.scenes.scene_problem import SceneProblem
 
 
 def add_options(parser: Parser) -> None:
@@ -41,29 +44,29 @@ def add_options(parser: Parser) -> None:
     text = "a dataset's folder; a dataset or pipeline by name, or a recipe file; boundary conditions in HDF5;"
     text += " or, with --robot, scenes"
     option("what", metavar="DIR|NAME|FILE", type=recipe_names.problems, help=text)
-    option(
-        "--n",
-        metavar="K",
-        type=values.rows,
-        help="number of problems; for a folder all of the split by default",
-    )
-    option("--split", metavar="NAME", help="split of the folder (default: validation)")
-    option(
-        "--first",
-        metavar="I",
-        type=values.natural,
-        help="first sample of the split (default: 0)",
-    )
-    option(
-        "--seed",
-        metavar="S",
-        type=values.seed,
-        help="root seed of fresh problems; default the recipe's",
-    )
+    add_selection(parser)
     text = "the problem of boundary conditions in HDF5; its tolerances are used"
     option("--problem", metavar="NAME|FILE", type=recipe_names.problem, help=text)
     text = f"{EXTRAPOLATE}, in HDF5"
     option("--extrapolate", action="store_true", default=None, help=text)
+    _add_scenes(parser)
+    option(
+        "-o",
+        "--out",
+        metavar="OUT",
+        type=Path,
+        help="output file (default: DIR-plans.h5 or NAME-plans.h5)",
+    )
+    text = "time per problem, such as 100ms, after which the first valid plan ends the search; 0: a first plan quickly"
+    option("--time-limit", metavar="SECONDS", type=values.time_limit, help=text)
+    option("--allow-large-angles", action="store_true", help=LARGE_ANGLES)
+    parser.epilog = f"{parser.epilog or ''}\n"
+    add_refine_options(parser)
+
+
+def _add_scenes(parser: Parser) -> None:
+    """Add the options of scenes."""
+    option = parser.add_argument
     text = "solve scenes with this problem of a robot, such as panda"
     option("--robot", metavar="NAME|FILE", type=recipe_names.problem, help=text)
     option("--allow-unused", metavar="KEY", action="append", help=ALLOW_UNUSED)
@@ -81,18 +84,6 @@ def add_options(parser: Parser) -> None:
     option("--smooth-stop", action="store_true", default=None, help=text)
     text = "folder with the packages of mesh files of scenes; may be repeated"
     option("--packages", metavar="FOLDER", type=Path, action="append", help=text)
-    option(
-        "-o",
-        "--out",
-        metavar="OUT",
-        type=Path,
-        help="output file (default: DIR-plans.h5 or NAME-plans.h5)",
-    )
-    text = "time per problem, such as 100ms, after which the first valid plan ends the search; 0: a first plan quickly"
-    option("--time-limit", metavar="SECONDS", type=values.time_limit, help=text)
-    option("--allow-large-angles", action="store_true", help=LARGE_ANGLES)
-    parser.epilog = f"{parser.epilog or ''}\n"
-    add_refine_options(parser)
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -120,7 +111,6 @@ def _solve_scenes(arguments: argparse.Namespace, out: Path) -> int:
 
     from cnpgen.make.solve_scenes import SceneOptions, solve_scenes
     from cnpgen.problems.problem_record import as_problem, record_problem
-    from cnpgen.problems.scenes.scene_reader import ReadingOptions, read_scenes
 
     refuse(
         arguments,
@@ -130,21 +120,7 @@ def _solve_scenes(arguments: argparse.Namespace, out: Path) -> int:
     if arguments.initial_plans is None:
         refuse(arguments, ["stay_within"], STAY_WITHIN)
     problem = as_problem(arguments.robot)
-    joints, positions = problem.robot.joints, arguments.start or ()
-    if positions and len(positions) != len(joints):
-        raise UsageError(
-            f"--start must have {len(joints)} positions of {listed(joints)}, got {len(positions)}"
-        )
-    scenes = read_scenes(
-        Path(arguments.what),
-        start=arguments.first or 0,
-        n=arguments.n,
-        options=ReadingOptions(
-            arguments.allow_unused or (),
-            arguments.packages or (),
-            dict(zip(joints, positions, strict=False)),
-        ),
-    )
+    scenes = _scenes(arguments, problem.robot.joints)
     record, initial = record_problem(problem), None
     if arguments.initial_plans is not None:
         initial = recipe_names.read_plans(arguments.initial_plans, problem=None)
@@ -170,13 +146,30 @@ def _solve_scenes(arguments: argparse.Namespace, out: Path) -> int:
         )
         return solve_scenes(problem, scenes, run=run, **options)
 
+    title = f"solving {arguments.what}"
     return refine_and_save(
-        arguments,
-        None,
-        out,
-        title=f"solving {arguments.what}",
-        make=solve,
-        request=request,
+        arguments, None, out, title=title, make=solve, request=request
+    )
+
+
+def _scenes(
+    arguments: argparse.Namespace, joints: "Sequence[str]"
+) -> "list[SceneProblem]":
+    """Read the scenes; the start positions of the planned joints are those of --start."""
+    from cnpgen.problems.scenes.scene_reader import ReadingOptions, read_scenes
+
+    positions = arguments.start or ()
+    if positions and len(positions) != len(joints):
+        raise UsageError(
+            f"--start must have {len(joints)} positions of {listed(joints)}, got {len(positions)}"
+        )
+    start = dict(zip(joints, positions, strict=False))
+    unused, packages = arguments.allow_unused or (), arguments.packages or ()
+    return read_scenes(
+        Path(arguments.what),
+        start=arguments.first or 0,
+        n=arguments.n,
+        options=ReadingOptions(unused, packages, start),
     )
 
 

@@ -58,15 +58,10 @@ def add_options(parser: Parser) -> None:
     )
     length = parser.add_mutually_exclusive_group().add_argument
     length("--cpu-seconds", metavar="S", type=values.seconds, help=_SECONDS)
-    length(
-        "--steps", metavar="N", type=values.positive, help="length of the run in steps"
-    )
-    length(
-        "--epochs",
-        metavar="E",
-        type=values.positive,
-        help="length of the run in passes over all samples",
-    )
+    text = "length of the run in steps"
+    length("--steps", metavar="N", type=values.positive, help=text)
+    text = "length of the run in passes over all samples"
+    length("--epochs", metavar="E", type=values.positive, help=text)
     option("--preset", choices=("paper",), help=_PRESET)
     add_settings(parser)
     text = "start from the parameters of a model, by name or file; --hidden, --layers, --features and --expected-time"
@@ -77,17 +72,10 @@ def add_options(parser: Parser) -> None:
     option("--check", metavar="N", type=values.positive, default=200, help=_CHECK)
     text = "train on scenes with this problem of a robot, such as panda"
     option("--robot", metavar="NAME|FILE", type=recipe_names.problem, help=text)
-    option(
-        "--workers",
-        metavar="W",
-        type=values.positive,
-        help="processes of the last validation, on up to 2,000 rows",
-    )
-    option(
-        "--force",
-        action="store_true",
-        help="replace MODEL, its log and another run's checkpoint",
-    )
+    text = "processes of the last validation, on up to 2,000 rows"
+    option("--workers", metavar="W", type=values.positive, help=text)
+    text = "replace MODEL, its log and another run's checkpoint"
+    option("--force", action="store_true", help=text)
 
 
 class Watch:
@@ -272,7 +260,8 @@ def summary(trained: "Trained") -> str:
     return _fitted(
         f"trained {steps} in {training['cpu_seconds']:.0f} s of CPU time and"
         f" {training['validation_cpu_seconds']:.0f} s for validations; this run took {trained.times};"
-        f" the model of step {best} is kept: {words}"
+        f" the model of step {best} is kept: {words}; goal_acceleration ="
+        f" {trained.model.goal_acceleration!r}"
     )
 
 

@@ -100,11 +100,8 @@ class CertifiedPlan(Stage):
 
     def prepare(self, context: Context) -> StageFunction:
         if context.dtype != "float64":
-            raise RecipeError(
-                [
-                    f"plans meet their boundary conditions in float64 only: needs it, got {context.dtype}"
-                ]
-            )
+            text = "plans meet their boundary conditions in float64 only: needs it, got"
+            raise RecipeError([f"{text} {context.dtype}"])
         solver = load_solver(context.problem, context.robot, context.kernels)
         solver_of_scenes = SceneSolver(context)
         planner = (
@@ -123,9 +120,8 @@ class CertifiedPlan(Stage):
                 poses = {OBSTACLE_POSES: scene_poses(context.problem.obstacle, scenes)}
             guess = None
             if planner is not None:
-                guess = planner.plan_batch(
-                    planner_boundary(columns, planner), columns=poses
-                ).motion
+                boundary = planner_boundary(columns, planner)
+                guess = planner.plan_batch(boundary, columns=poses).motion
             # Workers are processes already: threads of linear algebra would compete for
             # their cores.
             with one_thread():
@@ -135,9 +131,8 @@ class CertifiedPlan(Stage):
                     else solver_of_scenes(columns, scenes, guess)
                 )
             count, points, joints = motion.path.shape
-            candidates["path_control_points"] = np.ascontiguousarray(
-                motion.path.reshape(count, points * joints).T
-            )
+            path = motion.path.reshape(count, points * joints).T
+            candidates["path_control_points"] = np.ascontiguousarray(path)
             candidates["rate_control_points"] = np.ascontiguousarray(motion.rate.T)
             candidates["duration"] = motion.duration()[None]
             candidates.reject(valid, NO_PLAN)

@@ -264,26 +264,20 @@ def read_tasks(
     }
     for name, values in columns.items():
         if name not in known:
-            hint = nearest(
-                name, [column for field in fields.values() for column in field.columns]
-            )
-            text = f"tasks of this pipeline cannot give {name!r}{hint or ', only ' + ', '.join(fields)}"
+            parts = [column for field in fields.values() for column in field.columns]
+            hint = nearest(name, parts) or f", only {', '.join(fields)}"
+            text = f"tasks of this pipeline cannot give {name!r}{hint}"
             raise DatasetError(f"{path}: {text}")
-        if not np.isfinite(values).all():
-            row = int(
-                np.argmin(np.isfinite(values).reshape(len(values), -1).all(axis=1))
-            )
-            raise DatasetError(
-                f"{path}: {name} must be a finite number in every task, got {values[row]} in task {row}"
-            )
+        if not (finite := np.isfinite(values)).all():
+            row = int(np.argmin(finite.reshape(len(values), -1).all(axis=1)))
+            text = f"{name} must be a finite number in every task, got {values[row]} in task {row}"
+            raise DatasetError(f"{path}: {text}")
     # Tables of HDF5 have whole fields, CSV tables one column per component.
     found = {name: values for name, values in columns.items() if name in fields}
     for field in fields.values():
-        parts = [
-            column for column in field.columns if field.width and column in columns
-        ]
-        if parts:
-            found[field.name] = _joined(path, field, parts, columns, flat=flat)
+        own = [column for column in field.columns if field.width and column in columns]
+        if own:
+            found[field.name] = _joined(path, field, own, columns, flat=flat)
     return found
 
 

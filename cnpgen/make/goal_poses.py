@@ -34,6 +34,7 @@ from cnpgen.world.pose_ik import PoseKinematics, PoseTolerance, solve_pose_ik
 from cnpgen.world.world import World
 
 MAX_GOAL_STATES = 5  # of one task that are tried, the nearest first
+MAX_TREE_GOALS = 16  # of a scene with a time limit, which one tree has as roots
 POSE_REASON = "no inverse kinematics of the goal"
 POSE_SEEDS = 128  # of the inverse kinematics of a goal pose
 # Rad or m, of two goal states with one pose in their farthest joint.
@@ -93,6 +94,7 @@ def states_of_pose(
     *,
     start: Array,
     random: np.random.Generator,
+    most: int = MAX_GOAL_STATES,
 ) -> tuple[Array, Array]:
     """Return joint positions [rad] that can end a motion, nearest to the start (n,) first, and all with a goal pose.
 
@@ -117,14 +119,23 @@ def states_of_pose(
     valid = found if states is None else found[:, states.are_ends(found)]
     valid = valid[:, conditions.met(valid)]
     return nearest_states(
-        valid.T, start, kinematics.robot, min_difference=MIN_DIFFERENCE_RAD
+        valid.T,
+        start,
+        kinematics.robot,
+        min_difference=MIN_DIFFERENCE_RAD,
+        most=most,
     ), found.T.copy()
 
 
 def nearest_states(
-    states: Array, start: Array, robot: Robot, *, min_difference: float = 0.0
+    states: Array,
+    start: Array,
+    robot: Robot,
+    *,
+    min_difference: float = 0.0,
+    most: int = MAX_GOAL_STATES,
 ) -> Array:
-    """Return at most ``MAX_GOAL_STATES`` states [rad], shape (G, n), the nearest to the start, shape (n,), first.
+    """Return at most ``most`` states [rad], shape (G, n), the nearest to the start, shape (n,), first.
 
     The distance is the duration of the straight line at full speed. A state is left out
     if its farthest joint differs less than ``min_difference`` from a nearer state.
@@ -135,7 +146,7 @@ def nearest_states(
     chosen = list[Array]()
     # Stable: equal durations keep the order of the seeds, on every machine.
     for index in np.argsort(duration, kind="stable"):
-        if len(chosen) == MAX_GOAL_STATES:
+        if len(chosen) == most:
             break
         if all(
             np.abs(states[index] - other).max() >= min_difference for other in chosen
@@ -174,15 +185,9 @@ class PoseTasks:
     def __init__(self, problem: Problem) -> None:
         self._problem, self.robot = problem, load_robot(problem)
         joints, axes = self.robot.joint_names, ("x", "y", "z")
-        unit = self.robot.units("rad")
+        unit, start = self.robot.units("rad"), "joint positions at the start, at rest"
         fields = (
-            Field(
-                "start_q",
-                unit,
-                "joint positions at the start, at rest",
-                len(joints),
-                joints,
-            ),
+            Field("start_q", unit, start, len(joints), joints),
             Field("goal_xyz", "m", "position of the tip at the goal", 3, axes),
             Field(
                 "goal_wxyz",

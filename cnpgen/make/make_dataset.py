@@ -120,16 +120,15 @@ def make_dataset(
         "make_dataset", options, GenerationOptions(), old_keywords
     )
     where = Engine(chosen.engine, chosen.address, workers)
-    _check(chosen.part, force=force)
+    part, begin, model = chosen.part, chosen.begin, chosen.model
+    _check(part, force=force)
     loaded = as_dataset_recipe(recipe)
-    if chosen.model is not None and not certify:
-        raise UsageError(
-            "needs {certify}", argument="model", remedies={"certify": True}
-        )
-    loaded = certified(loaded, model=chosen.model) if certify else loaded
+    if model is not None and not certify:
+        needed = {"certify": True}
+        raise UsageError("needs {certify}", argument="model", remedies=needed)
+    loaded = certified(loaded, model=model) if certify else loaded
     notes = load_notes(loaded)
-    folder = dataset_folder(loaded, out)
-    workspace = find_workspace(folder)
+    workspace = find_workspace(dataset_folder(loaded, out))
     check_place(workspace)
     job = resolve(
         loaded,
@@ -142,15 +141,9 @@ def make_dataset(
         force=force,
     )
     # The specification in the folder may differ in informational keys, which are kept.
-    job = replace(job, spec=open_workspace(folder, job.spec, force=force))
-    return run(
-        job,
-        notes,
-        engine=where,
-        part=chosen.part,
-        begin=chosen.begin,
-        progress=progress,
-    )
+    spec = open_workspace(workspace.folder, job.spec, force=force)
+    job = replace(job, spec=spec)
+    return run(job, notes, engine=where, part=part, begin=begin, progress=progress)
 
 
 def run(

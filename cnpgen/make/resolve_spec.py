@@ -1,6 +1,7 @@
 """Resolution of the specification of a dataset: everything that determines its bytes."""
 
 import hashlib
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -59,8 +60,8 @@ def resolve(
     shard size, unless ``force`` deletes it.
     """
     total, root, shard_size = _check(recipe, n, seed, shard_size)
-    digest, begun = recipe_digest(recipe), workspace.spec
-    if begun is not None and (begun.recipe_sha256 != digest or force):
+    begun = workspace.spec
+    if begun is not None and (begun.recipe_sha256 != recipe_digest(recipe) or force):
         # Another dataset, or one that will be deleted.
         begun = None
     if begun is not None:
@@ -74,39 +75,60 @@ def resolve(
     if prepared.tasks is not None:
         total = _solved_tasks(prepared, recipe, root, n)
     rows = shard_size or default_shard_size(total, prepared.block_rows)
-    check_memory(
-        "shard_size",
-        rows,
-        min(rows, total) * sum(max(field.width, 1) for field in prepared.fields),
-    )
+    width = sum(max(field.width, 1) for field in prepared.fields)
+    check_memory("shard_size", rows, min(rows, total) * width)
     splits = split_rows(recipe, total)
-    spec = DatasetSpec(
+    spec = _spec(
+        recipe,
+        prepared,
+        splits,
+        begun,
+        seed=root,
+        rows=rows,
+        dtype=dtype,
+        backend=chosen,
+    )
+    return Job(workspace.folder, spec, recipe.pipeline, chosen, cache_folder)
+
+
+def _spec(
+    recipe: DatasetRecipe,
+    prepared: PreparedPipeline,
+    splits: Mapping[str, int],
+    begun: DatasetSpec | None,
+    *,
+    seed: int,
+    rows: int,
+    dtype: str,
+    backend: str,
+) -> DatasetSpec:
+    """Return the specification of a dataset that continues a begun one, if there is one."""
+    obstacles = recipe.pipeline.problem.obstacle
+    previous = (
+        begun.previous_splits if begun is not None and begun.splits == splits else ()
+    )
+    return DatasetSpec(
         name=recipe.name,
         version=recipe.version,
         title=recipe.title,
         license=recipe.license,
-        recipe_sha256=digest,
+        recipe_sha256=recipe_digest(recipe),
         recipe=resolved(recipe),
-        seed=root,
+        seed=seed,
         splits=splits,
         shard_size=rows,
         block_rows=prepared.block_rows,
         dtype=dtype,
-        backend=chosen,
+        backend=backend,
         fields=prepared.fields,
         robot=_robot_record(prepared),
         versions=versions(),
         # An extended dataset keeps its earlier versions, which determine the limits of
         # its shards.
-        previous_splits=begun.previous_splits
-        if begun is not None and begun.splits == splits
-        else (),
-        scene_obstacles=scene_capacity(recipe.pipeline.problem.obstacle)
-        if prepared.families
-        else 0,
+        previous_splits=previous,
+        scene_obstacles=scene_capacity(obstacles) if prepared.families else 0,
         scene_families=prepared.families,
     )
-    return Job(workspace.folder, spec, recipe.pipeline, chosen, cache_folder)
 
 
 def _check(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -12,9 +13,11 @@ from numpy.typing import NDArray
 
 from cnpgen.arrays import Array
 from cnpgen.errors import UsageError, counted
+from cnpgen.machine.engine import Engine
 from cnpgen.machine.times import NO_TIME, Times
 from cnpgen.make.goal_poses import (
     MAX_GOAL_STATES,
+    MAX_TREE_GOALS,
     POSE_REASON,
     POSE_SEEDS,
     EndConditions,
@@ -177,7 +180,8 @@ def solve_scenes(
     Scenes with equal numbers of obstacles of each kind, rounded up to multiples of
     four, share compiled kernels. Of several goal states, the ``MAX_GOAL_STATES``
     collision-free ones with the fastest straight lines are tried, and the result is the
-    best valid motion to any of them. A goal pose without goal states gets some by
+    best valid motion to any of them; with a time limit ``MAX_TREE_GOALS``, and the first
+    valid motion. A goal pose without goal states gets some by
     inverse kinematics; a scene for which it finds none is not solved, with the reason
     "no inverse kinematics of the goal".
 
@@ -198,52 +202,30 @@ def solve_scenes(
         "solve_scenes", run, SceneOptions(), old_keywords, keyword="run"
     )
     check_scenes(scenes)
-    loaded, scenes = as_problem(problem), [checked_scene(scene) for scene in scenes]
-    robot = load_robot(loaded)
-    _check_initial(loaded, len(scenes), chosen.initial)
-    # Scenes are placed before the problem changes, since attached objects have poses in
-    # frames of links.
-    placed = [placed_scene(scene, robot, start_state(scene, robot)) for scene in scenes]
-    loaded, robot, scenes = requested_problem(
-        loaded, robot, placed, payload=chosen.payload
-    )
-    goals = [_goals(loaded, robot, scene, index) for index, scene in enumerate(scenes)]
+    loaded, robot, scenes = _requested(as_problem(problem), scenes, chosen)
+    # One tree has all goals as roots; without a limit each of them is optimized.
+    most = MAX_GOAL_STATES if options.time_limit is None else MAX_TREE_GOALS
+    goals = [
+        _goals(loaded, robot, scene, index, most=most)
+        for index, scene in enumerate(scenes)
+    ]
     if chosen.begin is not None:
         chosen.begin(len(scenes), 0)
-
-    def report(finished: int, valid: int) -> None:
-        if progress is not None and finished:
-            progress(finished, valid)
-
+    refine = _refiner(chosen, progress, options, workers=workers, discard=discard)
     capacity = capacity_of(scenes)
     found, times, journals = dict[int, tuple[Plans, Attempt]](), NO_TIME, list[Path]()
     # Scenes of one capacity share kernels; each group has its own journal.
     for own, indices in _groups(scenes):
         file = None if journal is None else Path(f"{journal}.{len(journals)}")
         journals += [] if file is None else [file]
-        refinement = refine_tasks(
-            _adjusted(
-                _plans_of(
-                    loaded, scenes, [(index, goals[index]) for index in indices], own
-                ),
-                chosen,
-            ),
-            options=options,
-            workers=workers,
-            engine=chosen.engine,
-            address=chosen.address,
-            journal=file,
-            discard=discard,
-            begin=lambda _, finished: report(finished, finished),
-            progress=report,
-        )
+        of_group = [(index, goals[index]) for index in indices]
+        plans = _adjusted(_plans_of(loaded, scenes, of_group, own), chosen)
+        refinement = refine(plans, journal=file)
         times += refinement.times
-        # All plans of one file have the same obstacles, so that smaller groups get
-        # parked ones.
+        # Plans of one file have the same obstacles: smaller groups get parked ones.
         wide = with_wider_capacity(_without_options(refinement), loaded, own, capacity)
-        for row, (index, attempt) in enumerate(
-            zip(indices, refinement.results, strict=True)
-        ):
+        attempts = zip(indices, refinement.results, strict=True)
+        for row, (index, attempt) in enumerate(attempts):
             found[index] = wide[row], _with_reason(attempt, goals[index])
     every, results = zip(*(found[index] for index in range(len(scenes))), strict=True)
     solved = SolvedScenes(tuple(scenes), concatenate(every), results, times)
@@ -251,6 +233,42 @@ def solve_scenes(
     for file in journals:
         file.unlink(missing_ok=True)
     return solved
+
+
+def _requested(
+    problem: Problem, scenes: Sequence[SceneProblem], run: SceneOptions
+) -> tuple[Problem, Robot, list[SceneProblem]]:
+    """Return the problem that scenes ask for, its robot, and the placed scenes."""
+    checked, robot = [checked_scene(scene) for scene in scenes], load_robot(problem)
+    _check_initial(problem, len(scenes), run.initial)
+    # Scenes are placed before the problem changes, since attached objects have poses in
+    # frames of links.
+    placed = [placed_scene(each, robot, start_state(each, robot)) for each in checked]
+    return requested_problem(problem, robot, placed, payload=run.payload)
+
+
+def _refiner(
+    run: SceneOptions,
+    progress: Progress | None,
+    options: RefineOptions,
+    *,
+    workers: int | None,
+    discard: bool,
+) -> Callable[..., Refinement]:
+    """Return ``refine_tasks`` with the options of a run; ``progress`` gets finished plans of all groups."""
+
+    def report(finished: int, valid: int) -> None:
+        if progress is not None and finished:
+            progress(finished, valid)
+
+    return partial(
+        refine_tasks,
+        options=options,
+        engine=Engine(run.engine, run.address, workers),
+        discard=discard,
+        begin=lambda _, finished: report(finished, finished),
+        progress=report,
+    )
 
 
 def _check_initial(problem: Problem, count: int, initial: Plans | None) -> None:
@@ -336,20 +354,22 @@ def _plans_of(
     )
 
 
-def _goals(problem: Problem, robot: Robot, scene: SceneProblem, index: int) -> Array:
-    """Return the goal states of a scene that are tried, in this order, shape (G, n), G > 0."""
+def _goals(
+    problem: Problem, robot: Robot, scene: SceneProblem, index: int, *, most: int
+) -> Array:
+    """Return at most so many goal states of a scene that are tried, in this order, shape (G, n), G > 0."""
     if scene.goal_pose is not None:
         _frame_of(robot, scene, scene.goal_pose)
     if scene.other_goal_poses:
-        return _of_alternatives(problem, robot, scene, index)
+        return _of_alternatives(problem, robot, scene, index, most=most)
     if not len(scene.goal_q):
-        return _states_of_pose(problem, robot, scene, index)
+        return _states_of_pose(problem, robot, scene, index, most=most)
     states = goal_states(scene, robot)
     below, above = goal_tolerances(scene, robot)
     widths = below + above
     # A single exact goal state leaves no choice.
     if robot.shape is None or (len(states) == 1 and not widths.any()):
-        return states[:MAX_GOAL_STATES]
+        return states[:most]
     valid = _valid_ends(problem, robot, scene, states)
     if not len(valid) and widths.any():
         # The exact goal states are preferred; states within the tolerances are tried
@@ -357,7 +377,7 @@ def _goals(problem: Problem, robot: Robot, scene: SceneProblem, index: int) -> A
         near = _states_within(states, below, above, robot=robot, index=index)
         valid = _valid_ends(problem, robot, scene, near)
     start = start_state(scene, robot)
-    return nearest_states(valid, start, robot) if len(valid) else states[:1]
+    return nearest_states(valid, start, robot, most=most) if len(valid) else states[:1]
 
 
 def _valid_ends(
@@ -371,7 +391,7 @@ def _valid_ends(
 
 
 def _of_alternatives(
-    problem: Problem, robot: Robot, scene: SceneProblem, index: int
+    problem: Problem, robot: Robot, scene: SceneProblem, index: int, *, most: int
 ) -> Array:
     """Return goal states of all alternatives, the nearest valid ones if there are any, shape (G, n)."""
     plain = replace(scene, other_goal_poses=())
@@ -379,15 +399,15 @@ def _of_alternatives(
         replace(plain, goal_q=scene.goal_q[:0], goal_pose=pose)
         for pose in scene.other_goal_poses
     )
-    found = [_goals(problem, robot, each, index) for each in (plain, *poses)]
+    found = [_goals(problem, robot, each, index, most=most) for each in (plain, *poses)]
     states = np.concatenate(found)
     # nan stands for a goal pose without joint positions.
     known = states[~np.isnan(states).any(axis=1)]
     if robot.shape is None or not len(known):
-        return (known if len(known) else states)[:MAX_GOAL_STATES]
+        return (known if len(known) else states)[:most]
     valid = _valid_ends(problem, robot, scene, known)
     start = start_state(scene, robot)
-    return nearest_states(valid, start, robot) if len(valid) else known[:1]
+    return nearest_states(valid, start, robot, most=most) if len(valid) else known[:1]
 
 
 def _states_within(
@@ -403,7 +423,7 @@ def _states_within(
 
 
 def _states_of_pose(
-    problem: Problem, robot: Robot, scene: SceneProblem, index: int
+    problem: Problem, robot: Robot, scene: SceneProblem, index: int, *, most: int
 ) -> Array:
     """Return collision-free joint positions with the goal pose of a scene, shape (G, n), G > 0; nan without any."""
     pose = scene.goal_pose
@@ -417,7 +437,7 @@ def _states_of_pose(
     random = np.random.default_rng([index, POSE_SEEDS])
     start = start_state(scene, robot)
     goals, found = states_of_pose(
-        kinematics, states, conditions, pose, start=start, random=random
+        kinematics, states, conditions, pose, start=start, random=random, most=most
     )
     if not len(found):
         return np.full((1, robot.n), np.nan)

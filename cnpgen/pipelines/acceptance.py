@@ -55,66 +55,62 @@ def acceptance(
     tolerances of motions apply to ``given`` ends, whose state is from the user, for
     example a measurement; to others those of boundary states.
     """
-    ends: tuple[End, ...] = ("start", "goal")
-    hit = {
-        "start": (),
-        "goal": ("hit_angle", "hit_speed") if "hit_angle" in written else (),
-    }
-    kernels = {
-        end: context.kernels.load_by_structure(
-            boundary_unmet,
-            end=end,
-            needs=2 if f"{end}_ddq" in written else 1,
-            dtype=context.dtype,
-            exact=end not in given,
-            hitting=bool(hit[end]),
-        )
-        for end in ends
-    }
-    has_scenes = (
-        bool(scene_capacity(context.problem.obstacle))
-        and context.robot.shape is not None
-    )
-    narrow_phase = narrow_phase_of_scenes if has_scenes else narrow_phase_of
-    decisions = {
-        end: narrow_phase(context, end, exact=end not in given) for end in ends
-    }
-    n, constraints = context.robot.n, len(context.problem.constraint)
-    reasons = [
-        each.boundary_reason or each.reason for each in context.problem.constraint
-    ]
+    hit = ("hit_angle", "hit_speed") if "hit_angle" in written else ()
+    start_count = _unmet_count(context, "start", (), written, given)
+    goal_count = _unmet_count(context, "goal", hit, written, given)
+    constraints = context.problem.constraint
+    reasons = [each.boundary_reason or each.reason for each in constraints]
     reasons.append("tip not at its position")
-    reasons += ["hit not along its direction"] if hit["goal"] else []
+    reasons += ["hit not along its direction"] if hit else []
 
     def accept(candidates: CandidateBatch, _random: np.random.Generator) -> None:
-        obstacle_poses = candidate_poses(context.problem, candidates)
-        counts = []
-        for end in ends:
-            # A free acceleration is not checked: zero takes its place in the kernel.
-            acceleration = candidates.columns.get(f"{end}_ddq")
-            if acceleration is None:
-                acceleration = np.zeros((n, len(candidates.alive)))
-            state = candidates[f"{end}_q"], candidates[f"{end}_dq"], acceleration
-            (count,) = kernels[end](
-                *state,
-                obstacle_poses,
-                candidates[f"{end}_xyz"],
-                *(candidates[name] for name in hit[end]),
-            )
-            if decide := decisions[end]:
-                # Only candidates that meet everything else need Coal.
-                remaining = count[: constraints + 1].max(axis=0) <= 0
-                count[:constraints] += decide(
-                    state, obstacle_poses, remaining, candidates
-                )
-            counts.append(count)
-        start, goal = counts
+        poses = candidate_poses(context.problem, candidates)
+        start, goal = start_count(candidates, poses), goal_count(candidates, poses)
         # A row is unmet if it is at one of both ends; the goal may have one row more,
         # the direction of the hit.
         np.maximum(start, goal[: len(start)], out=goal[: len(start)])
         candidates.reject_first(goal <= 0, reasons)
 
     return accept
+
+
+def _unmet_count(
+    context: Context,
+    end: End,
+    hit: tuple[str, ...],
+    written: set[str],
+    given: Collection[End],
+) -> Callable[[CandidateBatch, Array], Array]:
+    """Return the function that counts unmet conditions of one end, a row per constraint, the tip position and a hit."""
+    exact, n = end not in given, context.robot.n
+    obstacles, constraints = context.problem.obstacle, len(context.problem.constraint)
+    kernel = context.kernels.load_by_structure(
+        boundary_unmet,
+        end=end,
+        needs=2 if f"{end}_ddq" in written else 1,
+        dtype=context.dtype,
+        exact=exact,
+        hitting=bool(hit),
+    )
+    has_scenes = scene_capacity(obstacles) and context.robot.shape is not None
+    narrow_phase = narrow_phase_of_scenes if has_scenes else narrow_phase_of
+    decide = narrow_phase(context, end, exact=exact)
+
+    def unmet_count(candidates: CandidateBatch, obstacle_poses: Array) -> Array:
+        # A free acceleration is not checked: zero takes its place in the kernel.
+        acceleration = candidates.columns.get(f"{end}_ddq")
+        if acceleration is None:
+            acceleration = np.zeros((n, len(candidates.alive)))
+        state = candidates[f"{end}_q"], candidates[f"{end}_dq"], acceleration
+        others = (candidates[name] for name in (f"{end}_xyz", *hit))
+        (count,) = kernel(*state, obstacle_poses, *others)
+        if decide:
+            # Only candidates that meet everything else need Coal.
+            remaining = count[: constraints + 1].max(axis=0) <= 0
+            count[:constraints] += decide(state, obstacle_poses, remaining, candidates)
+        return np.asarray(count)
+
+    return unmet_count
 
 
 def boundary_unmet(
@@ -138,40 +134,30 @@ def boundary_unmet(
     """
     import casadi as ca
 
-    columns, state = SymbolicState.of_symbols(
-        robot, problem.obstacle, problem.object_size, problem.scene_width
-    )
+    scene = problem.obstacle, problem.object_size, problem.scene_width
+    columns, state = SymbolicState.of_symbols(robot, *scene)
     p_sx, p = symbols("p", 3)
     rows: list[Scalar] = []
     for constraint in problem.constraint:
         count: Scalar = ca.SX(0)
-        along = {
-            condition.name: constraint.allowed(condition)
-            for condition in constraint.symbolic(state)
-        }
+        conditions = constraint.symbolic(state)
+        along = {item.name: constraint.allowed(item) for item in conditions}
         for condition in constraint.symbolic_at(state, end):
             # A conservative condition proves no violation; the narrow phase decides.
-            if condition.sufficient:
+            if condition.sufficient or not (exact or condition.name in along):
                 continue
-            if symbolic_needs(condition, *columns[1:3]) <= needs and (
-                exact or condition.name in along
-            ):
+            if symbolic_needs(condition, *columns[1:3]) <= needs:
                 tolerance = condition.tolerance(dtype)
-                tolerance = (
-                    tolerance if exact else np.maximum(along[condition.name], tolerance)
-                )
+                if not exact:
+                    tolerance = np.maximum(along[condition.name], tolerance)
                 count = count + unmet(condition, tolerance)
         rows.append(count)
-    miss = subtract(p, state.kinematics.tip)
-    rows.append(
-        ca.logic_not(ca.sqrt(dot(miss, miss)) <= BOUNDARY_TOLERANCES[dtype]["position"])
-    )
+    miss, accepted = subtract(p, state.kinematics.tip), BOUNDARY_TOLERANCES[dtype]
+    rows.append(ca.logic_not(ca.sqrt(dot(miss, miss)) <= accepted["position"]))
     hit = [ca.SX.sym("angle"), ca.SX.sym("speed")] if hitting else []
-    rows += (
-        [_direction_unmet(state.along_table(state.tip_velocity), *hit, dtype=dtype)]
-        if hit
-        else []
-    )
+    if hit:
+        velocity = state.along_table(state.tip_velocity)
+        rows.append(_direction_unmet(velocity, *hit, dtype=dtype))
     return ca.Function(f"boundary_{end}", [*columns, p_sx, *hit], [ca.vertcat(*rows)])
 
 
@@ -204,16 +190,11 @@ def narrow_phase_of(context: Context, end: End, *, exact: bool = True) -> Decide
         (width, N), a mask of the states to check, shape (N,), and the candidates. It
         returns a mask of the violated constraints, shape (constraints, N).
     """
-    problem, robot = context.problem, context.robot
-    if (
-        robot.shape is None
-        and robot.held_shape is None
-        and all(obstacle.upright for obstacle in problem.obstacle)
-    ):
+    problem, robot, dtype = context.problem, context.robot, context.dtype
+    has_shape = robot.shape is not None or robot.held_shape is not None
+    if not has_shape and all(obstacle.upright for obstacle in problem.obstacle):
         return None
-    kernel = context.kernels.load_by_structure(
-        narrow_phase, end=end, dtype=context.dtype
-    )
+    kernel = context.kernels.load_by_structure(narrow_phase, end=end, dtype=dtype)
     path = PathWorld(robot, problem.obstacle, problem.object_size)
 
     def decide_states(
@@ -223,25 +204,23 @@ def narrow_phase_of(context: Context, end: End, *, exact: bool = True) -> Decide
         _candidates: CandidateBatch | None,
     ) -> Mask:
         (unmet_counts,) = kernel(*state, obstacle_poses)
-        remaining, violated = (
-            (unmet_counts > 0) & mask,
-            np.zeros(unmet_counts.shape, bool),
-        )
+        remaining = (unmet_counts > 0) & mask
+        violated = np.zeros_like(remaining)
         # The batched check has one scene for all states; others are measured one by
         # one.
         one_scene = bool(np.all(obstacle_poses == obstacle_poses[:, :1]))
         for row in np.flatnonzero(remaining.any(axis=1)):
-            if problem.constraint[row].uses_obstacles and not one_scene:
+            constraint = problem.constraint[row]
+            if constraint.uses_obstacles and not one_scene:
                 continue
             candidates = np.flatnonzero(remaining[row])
-            tolerance = BOUNDARY_TOLERANCES[context.dtype]["position"]
+            tolerance = BOUNDARY_TOLERANCES[dtype]["position"]
             if not exact:
-                tolerance = max(tolerance, problem.constraint[row].effective_tolerance)
-            q, dq, ddq = (
-                np.ascontiguousarray(values[:, candidates], float) for values in state
-            )
+                tolerance = max(tolerance, constraint.effective_tolerance)
+            chosen = (values[:, candidates] for values in state)
+            q, dq, ddq = (np.ascontiguousarray(values, float) for values in chosen)
             path.set_path(q, dq, ddq, obstacle_poses[:, 0])
-            met = problem.constraint[row].met(path, tolerance)
+            met = constraint.met(path, tolerance)
             if met is not None:
                 remaining[row, candidates], violated[row, candidates] = False, ~met
         return violated | measure_one_by_one(state, obstacle_poses, remaining)
@@ -257,12 +236,9 @@ def narrow_phase_of_scenes(context: Context, end: End, *, exact: bool = True) ->
     ``MIN_SCENE_MARGIN_M`` above the required ones; Coal measures the others.
     """
     problem, clearance = context.problem, SceneClearance(context)
+    kinds = RobotClearance | SelfClearance
     by_distance = np.array(
-        [
-            isinstance(each, RobotClearance | SelfClearance)
-            for each in problem.constraint
-        ],
-        bool,
+        [isinstance(each, kinds) for each in problem.constraint], bool
     )
     measure_one_by_one = _one_by_one(context, end, exact=exact)
     obstacles, width = problem.obstacle, problem.scene_width
@@ -281,19 +257,12 @@ def narrow_phase_of_scenes(context: Context, end: End, *, exact: bool = True) ->
         mask: Mask,
         candidates: CandidateBatch | None,
     ) -> Mask:
-        q, remaining = (
-            np.ascontiguousarray(state[0], float),
-            np.zeros((len(by_distance), len(mask)), bool),
-        )
+        remaining = np.zeros((len(by_distance), len(mask)), bool)
         clear = np.zeros(len(mask), bool)
         if candidates is not None and candidates.scenes is not None:
-            clear = clearance.are_clear(
-                q,
-                candidates.scene,
-                candidates.scenes,
-                MIN_SCENE_MARGIN_M,
-                MIN_SCENE_MARGIN_M,
-            )
+            q, margins = np.ascontiguousarray(state[0], float), [MIN_SCENE_MARGIN_M] * 2
+            scene, scenes = candidates.scene, candidates.scenes
+            clear = clearance.are_clear(q, scene, scenes, *margins)
         # Compiled code proves most states clear; Coal decides on the others.
         remaining[by_distance] = ~clear & mask
         remaining[conservative] = mask

@@ -93,7 +93,8 @@ class Model:
     log: str = ""
 
     def __repr__(self) -> str:
-        return f"<Model of {self.problem.name!r}: a network of {self.architecture}>"
+        text = f"a network of {self.architecture}, goal_acceleration = {self.goal_acceleration!r}"
+        return f"<Model of {self.problem.name!r}: {text}>"
 
     @checked_arguments
     def outputs(self, tasks: Tasks) -> Outputs:
@@ -122,6 +123,11 @@ class Model:
         # Interior outputs tell how many control points the goal fixes.
         interior = self.architecture.path_outputs // len(self.problem.joint_names)
         return self.problem.trajectory.path_control_points - 3 - interior
+
+    @property
+    def goal_acceleration(self) -> str:
+        """Whether motions end with any acceleration, "free", or with that of the problem, "given"."""
+        return "free" if self.fixed_at_goal == 2 else "given"
 
     @property
     def is_rest_to_rest(self) -> bool:

@@ -53,7 +53,8 @@ class Planner:
         backend: Backend of the kernels; by default the fastest available.
 
     Attributes:
-        model: The model.
+        model: The model; its ``goal_acceleration`` is "free" if motions may end with
+            any acceleration.
         robot: The robot of its problem.
         backend: Backend of the kernels, as passed.
 

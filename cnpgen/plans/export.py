@@ -108,10 +108,8 @@ def export_plans(
     """
     exporter = load_exporter(to)
     if not 0 < rate <= MAX_RATE_HZ:
-        raise UsageError(
-            f"the rate must be above 0 and at most {MAX_RATE_HZ:g} Hz, got {rate}",
-            concerns="rate",
-        )
+        text = f"the rate must be above 0 and at most {MAX_RATE_HZ:g} Hz, got {rate}"
+        raise UsageError(text, concerns="rate")
     chosen = _chosen(plans, only)
     out, refused = Path(out), _refused(plans, rate, chosen)
     kept = [index for index in chosen if index not in refused]
@@ -121,46 +119,60 @@ def export_plans(
             f"none of the {len(chosen)} plans can be exported{': ' if reasons else ''}{reasons}"
         )
     if not exporter.single_file and out.exists() and not out.is_dir():
-        raise UsageError(
-            f"{out} is a file, but {to!r} makes one file per plan: give a folder",
-            concerns="out",
-        )
-    problem = plans.problem
+        text = f"{out} is a file, but {to!r} makes one file per plan: give a folder"
+        raise UsageError(text, concerns="out")
     sampled = _sampled(plans, rate, kept, exporter.ticks_per_s)
-    drive = open_problem(problem)[1].drive if "drive" in problem.content else None
+    has_drives = "drive" in plans.problem.content
+    drive = open_problem(plans.problem)[1].drive if has_drives else None
     if drive is not None:
         sampled = _with_torques(sampled, plans, drive)
-    exported = ExportedSet(
+    exported = replace(
+        _exported_set(plans, kept, exporter), rate=rate, has_drives=drive is not None
+    )
+    files, held = _write(exporter, out, sampled, exported, force=force)
+    invalid = tuple(
+        index for index in kept if plans.status[index] == PlanStatus.INVALID
+    )
+    return Exported(tuple(files), len(kept), refused, invalid, held)
+
+
+def _exported_set(
+    plans: Plans | JoinedPlans, kept: list[int], exporter: Exporter
+) -> ExportedSet:
+    problem = plans.problem
+    return ExportedSet(
         np.array(kept),
         plans.sample_id[kept],
         problem.joint_names,
         problem.prismatic_joints,
         problem.held_joints,
-        rate=rate,
         problem=problem.name,
         environment=_environment(plans, kept) if exporter.uses_environment else {},
         motion=plans.motion[kept] if isinstance(plans, Plans) else None,
         parameters=problem.parameters.names,
-        has_drives=drive is not None,
     )
-    held = None
+
+
+def _write(
+    exporter: Exporter,
+    out: Path,
+    sampled: Iterator[SampledPlan],
+    exported: ExportedSet,
+    *,
+    force: bool,
+) -> tuple[list[Path], Path | None]:
+    """Write one file, or one per plan to a folder; return them, and the file of held joints, if any."""
     folder = out.parent if exporter.single_file else out
     with machine_errors("write", folder):
         folder.mkdir(parents=True, exist_ok=True)
-    if exporter.single_file:
-        files = [
-            out / f"plans{exporter.suffix}"
-            if out.is_dir() and not exporter.is_folder
-            else out
-        ]
-        exporter.write(files[0], sampled, exported)
-    else:
-        files = [out / f"plan_{index:05d}{exporter.suffix}" for index in kept]
-        held = _write_each(exporter, files, sampled, exported, force=force)
-    invalid = tuple(
-        index for index in kept if plans.status[index] == PlanStatus.INVALID
-    )
-    return Exported(tuple(files), len(kept), refused, invalid, held)
+    if not exporter.single_file:
+        numbers = exported.index.tolist()
+        files = [out / f"plan_{index:05d}{exporter.suffix}" for index in numbers]
+        return files, _write_each(exporter, files, sampled, exported, force=force)
+    is_folder = out.is_dir() and not exporter.is_folder
+    file = out / f"plans{exporter.suffix}" if is_folder else out
+    exporter.write(file, sampled, exported)
+    return [file], None
 
 
 def _write_each(

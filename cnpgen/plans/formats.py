@@ -125,29 +125,7 @@ class ParquetTable(Exporter):
             import pyarrow
             import pyarrow.parquet
 
-        units = {"t": "s"} | {
-            name: units_of_joints(unit, exported.prismatic)
-            for name, unit in exported.columns.items()
-        }
-        held = json.dumps(exported.held_joints)
-        metadata = {
-            JOINT_NAMES_KEY: json.dumps(exported.joint_names),
-            "units": json.dumps(units),
-            "held_joints": held,
-        }
-        lists = {
-            name: pyarrow.list_(pyarrow.float64(), len(exported.joint_names))
-            for name in exported.columns
-        }
-        whole = {PLAN_COLUMN: pyarrow.int64(), "sample_id": pyarrow.int64()}
-        parameters = dict.fromkeys(
-            parameter_columns(exported.parameters), pyarrow.float64()
-        )
-        phase = {} if exported.motion is None else {PHASE_COLUMN: pyarrow.float64()}
-        schema = pyarrow.schema(
-            {**whole, "t": pyarrow.float64(), **lists, **phase, **parameters},
-            metadata=metadata,
-        )
+        schema = _parquet_schema(exported)
         samples = dict(
             zip(exported.index.tolist(), exported.sample_id.tolist(), strict=True)
         )
@@ -157,20 +135,41 @@ class ParquetTable(Exporter):
         ):
             for plan in plans:
                 count = len(plan.t)
-                whole_values = [
-                    np.full(count, plan.index),
-                    np.full(count, samples[plan.index]),
-                    plan.t,
-                ]
-                columns = [pyarrow.array(values) for values in whole_values]
+                ids = np.full(count, plan.index), np.full(count, samples[plan.index])
+                columns = [pyarrow.array(values) for values in (*ids, plan.t)]
                 columns += [
                     fixed_lists(getattr(plan, name)) for name in exported.columns
                 ]
-                columns += [pyarrow.array(plan.phase)] if phase else []
-                columns += [
-                    pyarrow.array(np.full(count, value)) for value in plan.parameters
-                ]
+                phase = [] if exported.motion is None else [plan.phase]
+                others = *phase, *(np.full(count, value) for value in plan.parameters)
+                columns += [pyarrow.array(values) for values in others]
                 writer.write_table(pyarrow.table(columns, schema=schema))
+
+
+def _parquet_schema(exported: ExportedSet) -> Any:
+    """Return names and types of the columns, with names of joints and units as metadata."""
+    import pyarrow
+
+    units = {"t": "s"} | {
+        name: units_of_joints(unit, exported.prismatic)
+        for name, unit in exported.columns.items()
+    }
+    metadata = {
+        JOINT_NAMES_KEY: json.dumps(exported.joint_names),
+        "units": json.dumps(units),
+        "held_joints": json.dumps(exported.held_joints),
+    }
+    whole, real = pyarrow.int64(), pyarrow.float64()
+    per_joint = pyarrow.list_(real, len(exported.joint_names))
+    phase = [] if exported.motion is None else [PHASE_COLUMN]
+    columns = {
+        PLAN_COLUMN: whole,
+        "sample_id": whole,
+        "t": real,
+        **dict.fromkeys(exported.columns, per_joint),
+        **dict.fromkeys([*phase, *parameter_columns(exported.parameters)], real),
+    }
+    return pyarrow.schema(columns, metadata=metadata)
 
 
 @dataclass(frozen=True)

@@ -251,33 +251,32 @@ def make_plans(
         for name, part in vars(boundary).items()
     }
     rows = path.shape[0] if path.ndim else 0
+    ids = np.arange(rows) if sample_id is None else sample_id
+    statuses = np.zeros(rows, np.uint8) if status is None else status
+    given = (columns or {}).items()
     plans = Plans(
         problem=record,
         boundary=Boundary(**parts),  # type: ignore[arg-type]
         path_control_points=path,
         rate_control_points=numbers("rate_control_points", rate_control_points),
         degree=record.trajectory.degree if degree is None else degree,
-        columns={
-            name: numbers(name, values) for name, values in (columns or {}).items()
-        },
-        sample_id=np.arange(rows)
-        if sample_id is None
-        else _integers("sample_id", sample_id, np.int64),
-        status=np.zeros(rows, np.uint8)
-        if status is None
-        else _integers("status", status, np.uint8),
+        columns={name: numbers(name, values) for name, values in given},
+        sample_id=_integers("sample_id", ids, np.int64),
+        status=_integers("status", statuses, np.uint8),
         source=source,
     )
-    robot = open_problem(record)[1]
+    robot, boundary = open_problem(record)[1], plans.boundary
     check_boundary_units(
-        robot,
-        plans.boundary,
-        argument="boundary",
-        allow_large_angles=allow_large_angles,
+        robot, boundary, argument="boundary", allow_large_angles=allow_large_angles
     )
+    return _with_tips(plans)
+
+
+def _with_tips(plans: Plans) -> Plans:
+    """Return plans with the positions of the tip at both ends, computed unless they are given."""
     ends = {"start_xyz": plans.boundary.start_q, "goal_xyz": plans.boundary.goal_q}
     missing = {
-        name: record.tip_positions(q)
+        name: plans.problem.tip_positions(q)
         for name, q in ends.items()
         if name not in plans.columns
     }

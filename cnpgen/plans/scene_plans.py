@@ -98,32 +98,32 @@ def scene_plans(
         goals = [goal_states(scene, robot)[0] for scene in scenes]
     goal_q = numbers("goals", goals)
     if goal_q.shape != start.shape:
-        raise UsageError(
-            f"must have shape {start.shape}, got {goal_q.shape}", argument="goals"
-        )
+        text = f"must have shape {start.shape}, got {goal_q.shape}"
+        raise UsageError(text, argument="goals")
     zero, spec, count = np.zeros_like(start), problem.trajectory, len(scenes)
-    poses = np.array(
-        [poses_of_scene(full, len(problem.obstacle), scene) for scene in scenes]
-    )
-    files = list(dict.fromkeys(scene.source for scene in scenes if scene.source))
-    others = f" and {len(files) - 1} other files" if len(files) > 1 else ""
+    fixed = len(problem.obstacle)
+    ids = None if sample_id is None else numbers("sample_id", sample_id, "int64")
+    poses = np.array([poses_of_scene(full, fixed, scene) for scene in scenes])
     return make_plans(
         record,
         Boundary(start, start_dq, zero, goal_q, zero, None),
         path_control_points=np.full((count, spec.path_control_points, robot.n), np.nan),
         rate_control_points=np.full((count, spec.rate_control_points), np.nan),
         columns={OBSTACLE_POSES: poses},
-        sample_id=np.arange(count)
-        if sample_id is None
-        else numbers("sample_id", sample_id, "int64"),
-        source=f"scenes of {files[0]}{others}{_accepted(scenes)}" if files else "",
+        sample_id=ids,
+        source=_source(scenes),
     )
 
 
-def _accepted(scenes: Sequence[SceneProblem]) -> str:
-    """Return a note of the elements of the files whose loss the caller accepted, for the source of plans."""
+def _source(scenes: Sequence[SceneProblem]) -> str:
+    """Return the source of plans: the files, and their elements whose loss the caller accepted."""
+    files = list(dict.fromkeys(scene.source for scene in scenes if scene.source))
+    if not files:
+        return ""
+    others = f" and {len(files) - 1} other files" if len(files) > 1 else ""
     names = sorted({name for scene in scenes for name in scene.request.accepted})
-    return f", without {', '.join(names)}" if names else ""
+    without = f", without {', '.join(names)}" if names else ""
+    return f"scenes of {files[0]}{others}{without}"
 
 
 def start_state(scene: SceneProblem, robot: Robot) -> Array:

@@ -164,11 +164,8 @@ def _robot_errors(raw: ProblemTables) -> Iterator[str]:
 
     Pinocchio checks the rest.
     """
-    joints, tip, where = (
-        raw.robot.get("joints"),
-        raw.robot.get("tip"),
-        raw.where / "robot",
-    )
+    joints, tip = raw.robot.get("joints"), raw.robot.get("tip")
+    where = raw.where / "robot"
     planned: list[Any] = joints if isinstance(joints, list) else []
     path = raw.urdf_path
     if path is None:
@@ -196,9 +193,8 @@ def _robot_errors(raw: ProblemTables) -> Iterator[str]:
     ]
     for name in planned:
         if isinstance(name, str) and name not in moving:
-            yield (where / "joints").message(
-                f"{path.name} has no joint {name!r} that moves{nearest(name, moving)}"
-            )
+            text = f"no joint {name!r} that moves{nearest(name, moving)}"
+            yield (where / "joints").message(f"{path.name} has {text}")
     if isinstance(tip, str) and (text := missing_frame(raw.urdf, path, tip)):
         yield (where / "tip").message(text)
     for name, low, high in _locked_outside(raw.urdf.iter("joint"), planned):
@@ -264,23 +260,7 @@ def _paper_errors(raw: ProblemTables) -> Iterator[str]:
 
 def limit_errors(problem: Problem, raw: ProblemTables) -> Iterator[str]:
     """Check that no limit exceeds that of the URDF so far that it must be in another unit or in percent."""
-    spec, limits = problem.robot, problem.limits
-    # Effort is often a placeholder.
-    per_joint = {
-        "velocity": limits.velocity,
-        "acceleration": limits.acceleration,
-    }
-    given: dict[str, list[tuple[float, ...]]] = {}
-    given |= {
-        key: [(value,) for value in limit.values]
-        for key, limit in per_joint.items()
-        if limit is not None
-    }
-    given |= (
-        {"position": [(span.low, span.high) for span in limits.position]}
-        if limits.position
-        else {}
-    )
+    spec, given = problem.robot, _given_limits(problem.limits)
     if raw.urdf is None:
         # Loading the robot raises the error.
         return
@@ -306,13 +286,24 @@ def limit_errors(problem: Problem, raw: ProblemTables) -> Iterator[str]:
             )
             if wrong is not None:
                 text = f"{name}: {ImplausibleValue(0, 0, wrong, low, high, unit)}"
-                hint = (
-                    ""
-                    if key == "acceleration"
-                    else f" ('{key}_scale' is a fraction of the URDF's limit)"
-                )
-                yield (raw.where / "limits" / key).message(text + hint)
+                if key != "acceleration":
+                    text += f" ('{key}_scale' is a fraction of the URDF's limit)"
+                yield (raw.where / "limits" / key).message(text)
                 break
+
+
+def _given_limits(limits: LimitSpec) -> dict[str, list[tuple[float, ...]]]:
+    """Return the limits that a problem states, one row for all joints or one for each."""
+    # Effort is often a placeholder.
+    per_joint = {"velocity": limits.velocity, "acceleration": limits.acceleration}
+    given: dict[str, list[tuple[float, ...]]] = {
+        key: [(value,) for value in limit.values]
+        for key, limit in per_joint.items()
+        if limit is not None
+    }
+    if limits.position:
+        given["position"] = [(span.low, span.high) for span in limits.position]
+    return given
 
 
 def _plausible_limit(joint: ElementTree.Element, key: str) -> tuple[float, float, str]:

@@ -15,6 +15,7 @@ from cnpgen.robots.chain import chain_from_model
 from cnpgen.robots.drive import Drive, DriveSpec, SpeedLine
 from cnpgen.robots.obstacle import Obstacle
 from cnpgen.robots.robot import Attached, Robot, read_model, recipe_errors_in
+from cnpgen.robots.robot_spec import LimitSpec
 from cnpgen.robots.scene import PARKED_POSITION_M
 from cnpgen.robots.shape.convex_part import turned
 from cnpgen.robots.shape.inline import unit_of_mesh
@@ -56,24 +57,12 @@ def load_robot(problem: Problem) -> Robot:
         rated = _given(limits.velocity, "velocity", model.velocityLimit)
         torque = _given(limits.torque, "torque", model.effortLimit)
         velocity = limits.velocity_scale * rated
-        # Default: a_max = min(rate * v_max, cap, limit of the URDF 1.2); the problem
-        # may replace it.
-        most = np.minimum(limits.acceleration_rate * velocity, limits.acceleration_cap)
-        most = np.minimum(most, _rates(joints, "acceleration"))
-        acceleration = _given(limits.acceleration, "acceleration", most)
-        # Default: j_max = min(JERK_RATE * a_max, limit of the URDF 1.2).
-        most = np.minimum(JERK_RATE * acceleration, _rates(joints, "jerk"))
-        jerk = _given(limits.jerk, "jerk", most)
+        acceleration, jerk = _acceleration_and_jerk(limits, velocity, joints)
         drive = _drive(problem, joints, limits.torque_scale, torque)
+    lower = np.array(model.lowerPositionLimit)
+    upper = np.array(model.upperPositionLimit)
     # Ranges are scaled about their center c: c +- scale * (upper - lower) / 2.
-    center = (
-        np.array(model.upperPositionLimit) + np.array(model.lowerPositionLimit)
-    ) / 2
-    half = (
-        limits.position_scale
-        * (np.array(model.upperPositionLimit) - np.array(model.lowerPositionLimit))
-        / 2
-    )
+    center, half = (upper + lower) / 2, limits.position_scale * (upper - lower) / 2
     robot = Robot(
         urdf=problem.urdf_path,
         urdf_text=urdf,
@@ -96,19 +85,18 @@ def load_robot(problem: Problem) -> Robot:
     )
     if errors := list(_errors(problem, robot)):
         raise RecipeError(errors)
+    return _with_shapes(problem, robot)
+
+
+def _with_shapes(problem: Problem, robot: Robot) -> Robot:
+    """Return a robot with the geometry of its links and of the held object, whose sizes are checked."""
     with recipe_errors_in(problem.path):
-        shape = (
-            load_shape(urdf, robot.model, kept_folder())
-            if spec.geometry == "urdf"
-            else None
-        )
-        robot = replace(
-            robot,
-            shape=shape,
-            held_shape=_held_shape(problem, robot),
-            # Expensive to build again.
-            built_model=robot.model,
-        )
+        model, shape = robot.model, None
+        if problem.robot.geometry == "urdf":
+            shape = load_shape(robot.urdf_text, model, kept_folder())
+        held = _held_shape(problem, robot)
+    # The model is expensive to build again.
+    robot = replace(robot, shape=shape, held_shape=held, built_model=model)
     # Stored problems were accepted before, possibly by earlier rules.
     if not problem.is_stored:
         _check_sizes(problem, robot)
@@ -135,6 +123,20 @@ def _attached(problem: Problem) -> Attached:
         },
         uses_soft_limits=problem.limits.soft == "use",
     )
+
+
+def _acceleration_and_jerk(
+    limits: LimitSpec, velocity: Array, joints: Sequence[UrdfJoint]
+) -> tuple[Array, Array]:
+    """Return the limits of accelerations and jerks, shape (n,) each, for those of velocities."""
+    # Default: a_max = min(rate * v_max, cap, limit of the URDF 1.2); the problem may
+    # replace it.
+    most = np.minimum(limits.acceleration_rate * velocity, limits.acceleration_cap)
+    most = np.minimum(most, _rates(joints, "acceleration"))
+    acceleration = _given(limits.acceleration, "acceleration", most)
+    # Default: j_max = min(JERK_RATE * a_max, limit of the URDF 1.2).
+    most = np.minimum(JERK_RATE * acceleration, _rates(joints, "jerk"))
+    return acceleration, _given(limits.jerk, "jerk", most)
 
 
 def _rates(joints: Sequence[UrdfJoint], name: str) -> Array:

@@ -53,8 +53,7 @@ def scene_of(
         obstacle_poses: Poses and sizes of the obstacles of each sample, shape (N,
             width), in place of the problem's.
     """
-    # The object is upright and centered at the tip: its bottom is half its height
-    # below.
+    # The object is upright and centered at the tip: half of its height is below.
     half = 0.0 if problem.object is None else problem.object.size[2] / 2
     parts, constraint = [], problem.scene_constraint
     if problem.obstacle:
@@ -67,21 +66,16 @@ def scene_of(
         parameters = np.tile(problem.nominal_parameters, (len(start_xyz), 1))
     if constraint is not None:
         if goal_velocity is None:
-            raise UsageError(
-                f"is missing: the problem {problem.name!r} needs it",
-                argument="goal_velocity",
-            )
+            text = f"is missing: the problem {problem.name!r} needs it"
+            raise UsageError(text, argument="goal_velocity")
         shapes = [xyz.shape for xyz in (start_xyz, goal_xyz, goal_velocity)]
-        if not shapes[0] == shapes[1] == shapes[2] == (len(start_xyz), 3):
-            raise UsageError(
-                f"positions and velocities must have one shape (N, 3), got {shapes}"
-            )
+        if set(shapes) != {(len(start_xyz), 3)}:
+            text = f"positions and velocities must have one shape (N, 3), got {shapes}"
+            raise UsageError(text)
         # The puck lies on the table, whose frame differs from sample to sample.
         if (frame := table_frame_of(problem, parameters)) is not None:
-            goal_xyz, goal_velocity = (
-                frame.to_table(goal_xyz),
-                frame.along_table(goal_velocity),
-            )
+            goal_velocity = frame.along_table(goal_velocity)
+            goal_xyz = frame.to_table(goal_xyz)
         parts.append(constraint.scene_values(goal_xyz, goal_velocity))
     if parameters is not None:
         parts.append(parameters)

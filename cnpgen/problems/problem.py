@@ -435,31 +435,25 @@ class Problem:
         # Meshes need not exist where no constraint uses the geometry.
         if not self.uses_link_geometry:
             return text
-        # The geometry of a stored problem is in its file, with the additions that were
-        # made then.
+        # The geometry of a stored problem is in its file, with the additions of then.
         if not self.is_stored:
             text = with_collision_geometry(text, spec.visual_links, spec.skipped_meshes)
-        # Only decompositions into several parts are kept in the cache.
-        keep = kept_folder() if spec.convex_parts > 1 else None
         text = with_inline_meshes(
             text,
             self.urdf_path,
             self.packages,
             most=spec.convex_parts,
             links=spec.decomposed,
-            keep=keep,
+            # Only decompositions into several parts are kept in the cache.
+            keep=kept_folder() if spec.convex_parts > 1 else None,
         )
         if spec.srdf:
             srdf = self.path.parent / spec.srdf
             text = with_disabled_pairs(text, srdf, allow_unused=spec.allow_unused)
-        ignored = spec.ignored_pairs
         text = with_payload_link(text, spec, self.payload, is_stored=self.is_stored)
-        if self.payload is not None:
-            ignored = (
-                *ignored,
-                # Links that hold the payload touch it in every state.
-                *((link, PAYLOAD) for link in self.payload.touch_links),
-            )
+        # Links that hold the payload touch it in every state.
+        touching = () if self.payload is None else self.payload.touch_links
+        ignored = *spec.ignored_pairs, *((link, PAYLOAD) for link in touching)
         # Last: the ignored pairs may name the link of the payload.
         return with_ignored_pairs(text, ignored) if ignored else text
 

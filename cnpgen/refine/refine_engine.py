@@ -1,6 +1,6 @@
 """Refiners of problems with their kernels, and the refinement of plans in one process."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import replace
 from functools import lru_cache
 from threading import get_ident
@@ -15,6 +15,7 @@ from cnpgen.problems.obstacles import goal_velocities, scene_of
 from cnpgen.problems.problem import Problem
 from cnpgen.problems.problem_record import ProblemRecord, open_problem
 from cnpgen.refine.first_plan import refine_task_within
+from cnpgen.refine.goal_options import min_durations, order_by_tree, refine_to_any
 from cnpgen.refine.options import RefineOptions
 from cnpgen.refine.refiner import Refiner
 from cnpgen.refine.strategy import PlanChecker, refine_task, refine_task_until
@@ -36,20 +37,42 @@ def refine_serially(plans: Plans, options: RefineOptions) -> list[Attempt]:
     Where control points are not finite or rates not positive, the input plan is not
     used.
     """
+    rows = ([row] for row in range(len(plans)))
+    return [result for _, result in refine_groups(plans, rows, options)]
+
+
+def refine_groups(
+    plans: Plans, groups: Iterable[list[int]], options: RefineOptions
+) -> list[tuple[int, Attempt]]:
+    """Refine groups of rows, each to the goal states of one task; return the row of the best result of each, and it."""
     refiner = prepare(plans, options)
-    checker = _checker(plans.problem, plans.degree, get_ident())
     tasks = [replace(task, stay_within=options.stay_within) for task in tasks_of(plans)]
-    if options.deadline is not None:
-        return [
-            refine_task_until(refiner, checker, task, options.deadline)
-            for task in tasks
-        ]
-    if options.time_limit is not None:
-        return [
-            refine_task_within(refiner, checker, task, options.time_limit)
-            for task in tasks
-        ]
-    return [refine_task(refiner, checker, task) for task in tasks]
+    checker = _checker(plans.problem, plans.degree, get_ident())
+
+    def refine(task: RefinementTask) -> Attempt:
+        if options.deadline is not None:
+            return refine_task_until(refiner, checker, task, options.deadline)
+        if options.time_limit is not None:
+            return refine_task_within(refiner, checker, task, options.time_limit)
+        return refine_task(refiner, checker, task)
+
+    results = list[tuple[int, Attempt]]()
+    for rows in groups:
+        goals, first_valid = (
+            [tasks[row] for row in rows],
+            options.time_limit is not None,
+        )
+        index, result = refine_to_any(
+            goals,
+            refine,
+            order=order_by_tree(refiner, goals)
+            if first_valid and len(rows) > 1
+            else range(len(rows)),
+            min_durations=min_durations(plans[rows]) if len(rows) > 1 else np.zeros(1),
+            first_valid=first_valid,
+        )
+        results.append((rows[index], result))
+    return results
 
 
 def prepare(plans: Plans, options: RefineOptions) -> Refiner:

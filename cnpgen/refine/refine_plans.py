@@ -10,7 +10,6 @@ from contextlib import closing
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -21,9 +20,9 @@ from cnpgen.machine.versions import __version__
 from cnpgen.plans.format import GOAL_OPTION, PlanStatus
 from cnpgen.plans.plans import Plans, screen
 from cnpgen.plans.tips import correct_tips
-from cnpgen.refine.goal_options import Progress, refine_goal_options
+from cnpgen.refine.goal_options import Progress, goal_groups
 from cnpgen.refine.options import DEFAULT_OPTIONS, RefineOptions
-from cnpgen.refine.refine_engine import prepare, refine_serially
+from cnpgen.refine.refine_engine import prepare, refine_groups
 from cnpgen.refine.refinement import Refinement
 from cnpgen.refine.refinement_journal import Journal, open_journal
 from cnpgen.refine.task import Attempt
@@ -67,38 +66,13 @@ def solve_plans(
     )
     return refine_tasks(
         without_plans,
-        options=options,
-        workers=workers,
-        engine=engine,
-        address=address,
+        options,
+        Engine(engine, address, workers),
         journal=journal,
         discard=discard,
         begin=begin,
         progress=progress,
     )
-
-
-def refine_tasks(
-    plans: Plans,
-    *,
-    options: RefineOptions,
-    journal: str | Path | None,
-    begin: Callable[[int, int], None] | None,
-    progress: Progress | None,
-    **run: Any,
-) -> Refinement:
-    """Refine plans, or plan where control points are nan; goal states of tasks are those of ``solve_plans``."""
-    refine: Callable[..., Refinement] = partial(refine_plans, options=options, **run)
-    if GOAL_OPTION in plans.columns and len(plans):
-        return refine_goal_options(
-            plans,
-            refine,
-            journal=journal,
-            begin=begin,
-            progress=progress,
-            first_valid=options.time_limit is not None,
-        )
-    return refine(plans, journal=journal, begin=begin, progress=progress)
 
 
 @checked_arguments
@@ -142,34 +116,64 @@ def refine_plans(
         RecipeError: The problem needs a plug-in that is not installed.
         MachineError: A worker died, or the journal cannot be written.
     """
-    watch, where = Stopwatch(), Engine(engine, address, workers)
-    plans = correct_tips(plans)
+    return refine_tasks(
+        plans,
+        options,
+        Engine(engine, address, workers),
+        journal=journal,
+        discard=discard,
+        begin=begin,
+        progress=progress,
+        to_any_goal=False,
+    )
+
+
+def refine_tasks(
+    plans: Plans,
+    options: RefineOptions,
+    engine: Engine,
+    *,
+    journal: str | Path | None,
+    discard: bool,
+    begin: Callable[[int, int], None] | None,
+    progress: Progress | None,
+    to_any_goal: bool = True,
+) -> Refinement:
+    """Refine plans as ``refine_plans`` does, and ``to_any_goal`` of a task as ``solve_plans`` does."""
+    watch, plans = Stopwatch(), correct_tips(plans)
+    several = to_any_goal and GOAL_OPTION in plans.columns
+    groups = goal_groups(plans) if several else [[row] for row in range(len(plans))]
+    identity = identity_of_run(plans, options, tasks=len(groups))
     file = (
         None
         if journal is None
-        else open_journal(
-            Path(journal), identity_of_run(plans, options), discard=discard
-        )
+        else open_journal(Path(journal), identity, discard=discard)
     )
     finished: dict[int, Attempt] = {} if file is None else dict(file.finished)
+    waiting = [rows for rows in groups if finished.keys().isdisjoint(rows)]
     if begin is not None:
-        begin(len(plans), len(finished))
+        begin(len(groups), len(groups) - len(waiting))
     try:
-        waiting = [i for i in range(len(plans)) if i not in finished]
-        for results in _run(plans, waiting, options, where, journal=file, watch=watch):
+        for results in _run(plans, waiting, options, engine, journal=file, watch=watch):
             finished |= results
             if progress is not None:
                 progress(len(results), sum(result.valid for result in results.values()))
     finally:
         if file is not None:
             file.close()
-    refinement = _refinement(plans, [finished[i] for i in range(len(plans))], options)
+    # One row of every group has a result.
+    chosen = [row for rows in groups for row in rows if row in finished]
+    refinement = _refinement(
+        plans if len(groups) == len(plans) else plans[chosen],
+        [finished[row] for row in chosen],
+        options,
+    )
     return replace(refinement, times=watch.times())
 
 
 def _run(
     plans: Plans,
-    waiting: list[int],
+    waiting: list[list[int]],
     options: RefineOptions,
     engine: Engine,
     *,
@@ -196,29 +200,34 @@ def _run(
         parts = (
             waiting[first : first + size] for first in range(0, len(waiting), size)
         )
-        tasks = ((part, plans[np.array(part)]) for part in parts)
+        tasks = ((part, plans[np.concatenate(part)]) for part in parts)
         with closing(
             pool.distribute(partial(_refine, options=options), tasks, hint=hint)
         ) as results:
-            for part, attempts, seconds in results:
+            for rows, attempts, seconds in results:
                 # CPU time of all workers, shared among them.
                 watch.computing += seconds / count
                 if journal is not None:
                     # Recorded before use: a crash afterwards does not lose it.
-                    journal.append(part, attempts)
-                yield dict(zip(part, attempts, strict=True))
+                    journal.append(rows, attempts)
+                yield dict(zip(rows, attempts, strict=True))
 
 
 def _refine(
-    task: tuple[list[int], Plans], *, options: RefineOptions
+    task: tuple[list[list[int]], Plans], *, options: RefineOptions
 ) -> tuple[list[int], list[Attempt], float]:
-    """Refine some of the plans.
+    """Refine some groups of the plans.
 
-    Return their indices, the results and the CPU time [s].
+    Return the row of each result, the results and the CPU time [s].
     """
     (part, plans), begun = task, time.thread_time()
+    rows, places = np.concatenate(part), iter(range(len(plans)))
+    # Their places among the plans that were sent.
+    groups = [[next(places) for _ in group] for group in part]
     with one_thread():
-        return part, refine_serially(plans, options), time.thread_time() - begun
+        results = refine_groups(plans, groups, options)
+    chosen = [int(rows[place]) for place, _ in results]
+    return chosen, [result for _, result in results], time.thread_time() - begun
 
 
 def _refinement(
@@ -252,8 +261,10 @@ def _refinement(
     return Refinement(plans, replace(refined, status=status), tuple(results))
 
 
-def identity_of_run(plans: Plans, options: RefineOptions) -> str:
-    """Return the JSON text that identifies a run: version, options and a checksum of the plans."""
+def identity_of_run(
+    plans: Plans, options: RefineOptions, *, tasks: int | None = None
+) -> str:
+    """Return the JSON text that identifies a run: version, options, number of tasks and a checksum of the plans."""
     digest = hashlib.sha256(plans.problem.recipe.encode() + plans.problem.urdf.encode())
     boundary = [
         values for values in vars(plans.boundary).values() if values is not None
@@ -278,6 +289,7 @@ def identity_of_run(plans: Plans, options: RefineOptions) -> str:
             "version": __version__,
             "options": options.document(),
             "degree": plans.degree,
+            "tasks": len(plans) if tasks is None else tasks,
             "plans": digest.hexdigest(),
         }
     )

@@ -295,12 +295,15 @@ class TreeSearch:
     these find few paths. The paths are sorted by an estimated duration. Large trees
     with shorter edges follow one by one, until a motion along one of their paths is
     valid. Conditions other than distances are checked on the paths, not in the trees.
+    Of several ``goals``, shape (G, n), which replace that of the task, all are roots of
+    one tree.
     """
 
     task: RefinementTask
     space: RestSpace
     hulls: Hulls
     manifold: EqualityKernel | None
+    goals: Array | None = None
 
     def paths(self) -> Iterator[Array]:
         """Yield paths, corners of shape (K, n) each.
@@ -310,11 +313,11 @@ class TreeSearch:
         Paths of large trees with shorter edges follow.
         """
         found, seeds = list[Array](), count()
-        line = self._line()
+        line = self.line()
         if line is not None:
             yield line
             return
-        found += self._small_trees(seeds)
+        found += self.small_trees(seeds)
         # Large trees only if small ones find too few paths.
         missing = max(MIN_TREE_PATHS - len(found), 0)
         found += islice(
@@ -334,14 +337,14 @@ class TreeSearch:
 
     def first_paths(self) -> Iterator[Array]:
         """Yield the line if it is valid, else the paths of small trees, each as soon as it is found."""
-        line = self._line()
-        yield from self._small_trees(count()) if line is None else [line]
+        line = self.line()
+        yield from self.small_trees(count()) if line is None else [line]
 
-    def _line(self) -> Array | None:
+    def line(self) -> Array | None:
         """Return the straight line if it is valid: trees without extensions connect."""
         return self._grow(0, 0, TREE_EXTENSION_RAD)
 
-    def _small_trees(self, seeds: Iterator[int]) -> Iterator[Array]:
+    def small_trees(self, seeds: Iterator[int]) -> Iterator[Array]:
         """Yield the paths of small trees with every margin, and of further ones if these find enough."""
         number = 0
         for seed in islice(seeds, SMALL_TREES):
@@ -386,10 +389,11 @@ class TreeSearch:
             )
             settings = replace(settings, spacing=MANIFOLD_SPACING_RAD, max_nodes=nodes)
         task, robot = self.task, self.space.robot
-        start, goal = task.boundary.start_q[0], task.boundary.goal_q[0]
+        start = task.boundary.start_q[0]
+        goals = task.boundary.goal_q if self.goals is None else self.goals
         lower, upper = (
-            np.minimum(start, goal) - MAX_TURN,
-            np.maximum(start, goal) + MAX_TURN,
+            np.minimum(start, goals.min(axis=0)) - MAX_TURN,
+            np.maximum(start, goals.max(axis=0)) + MAX_TURN,
         )
         box = (
             np.maximum(robot.position_lower, lower),
@@ -398,7 +402,7 @@ class TreeSearch:
         checker = self.hulls.placed_checker(task.scene.poses[0])
         return find_tree_path(
             checker,
-            (start, goal),
+            (start, goals),
             box,
             robot.velocity_limit,
             settings,

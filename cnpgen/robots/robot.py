@@ -218,29 +218,7 @@ def read_model(
     """Build the model of ``reduced_model``, and return the planned joints of the URDF with it."""
     import pinocchio as pin
 
-    try:
-        tree = urdf_tree(text)
-        if errors := [f"robot.joints: {text}" for text in _mimic_errors(tree, joints)]:
-            raise RecipeError(errors)
-        limited = bounded(text, tree, attached)
-        with recipe_errors_in(urdf):
-            parameters = urdf_parameters(tree)
-            _check_order_of_limits(parameters, joints)
-        try:
-            model = pin.buildModelFromXML(limited)
-        except ValueError:
-            with recipe_errors_in(urdf):
-                # The refusal may come from swapped limits of a joint that is not
-                # planned.
-                _check_order_of_limits(
-                    parameters, [joint.name for joint in parameters.joints.values()]
-                )
-            raise
-        name_links_uniquely(model)
-    except (ValueError, RuntimeError, IndexError) as error:
-        raise RecipeError(
-            [f"{urdf}: not a URDF that Pinocchio can read: {error}"]
-        ) from error
+    model, parameters = _complete_model(urdf, text, joints, attached)
     known = list(model.names)[1:]
     missing = [
         f"{urdf.name} has no joint {name!r}{nearest(name, known)}"
@@ -249,9 +227,7 @@ def read_model(
     ]
     if missing:
         raise RecipeError([f"robot.joints: {text}" for text in missing])
-    locked = [
-        index for index in range(1, model.njoints) if model.names[index] not in joints
-    ]
+    locked = [index for index, name in enumerate(known, 1) if name not in joints]
     reduced = (
         pin.buildReducedModel(model, locked, pin.neutral(model)) if locked else model
     )
@@ -271,6 +247,37 @@ def read_model(
     # Attachments come after the comparison with the URDF, which does not contain them.
     attach(reduced, attached)
     return reduced, planned
+
+
+def _complete_model(
+    urdf: Path, text: str, joints: tuple[str, ...], attached: Attached
+) -> tuple["pin.Model", UrdfParameters]:
+    """Build the model of all joints of a URDF, and return its numbers with it."""
+    import pinocchio as pin
+
+    try:
+        tree = urdf_tree(text)
+        if errors := [f"robot.joints: {text}" for text in _mimic_errors(tree, joints)]:
+            raise RecipeError(errors)
+        limited = bounded(text, tree, attached)
+        with recipe_errors_in(urdf):
+            parameters = urdf_parameters(tree)
+            _check_order_of_limits(parameters, joints)
+        try:
+            model = pin.buildModelFromXML(limited)
+        except ValueError:
+            with recipe_errors_in(urdf):
+                # The refusal may come from swapped limits of a joint that is not
+                # planned.
+                names = [joint.name for joint in parameters.joints.values()]
+                _check_order_of_limits(parameters, names)
+            raise
+        name_links_uniquely(model)
+    except (ValueError, RuntimeError, IndexError) as error:
+        raise RecipeError(
+            [f"{urdf}: not a URDF that Pinocchio can read: {error}"]
+        ) from error
+    return model, parameters
 
 
 def _narrow_to_soft_limits(

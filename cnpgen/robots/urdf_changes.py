@@ -336,29 +336,18 @@ def _elements(
         )
     for name in payload.touch_links:
         if name not in links:
-            raise RecipeError(
-                [
-                    f"payload.touch_links: the URDF has no link {name!r}{nearest(name, links)}"
-                ]
-            )
-    link, joint = (
-        ElementTree.Element("link", name=PAYLOAD),
-        ElementTree.Element("joint", name=PAYLOAD, type="fixed"),
-    )
+            text = f"the URDF has no link {name!r}{nearest(name, links)}"
+            raise RecipeError([f"payload.touch_links: {text}"])
+    link = ElementTree.Element("link", name=PAYLOAD)
     for kind in ("visual", "collision"):
-        geometry = ElementTree.SubElement(
-            ElementTree.SubElement(link, kind), "geometry"
-        )
+        element = ElementTree.SubElement(link, kind)
+        geometry = ElementTree.SubElement(element, "geometry")
         ElementTree.SubElement(geometry, "box", size=numbers_text(payload.size or ()))
+    joint = ElementTree.Element("joint", name=PAYLOAD, type="fixed")
     ElementTree.SubElement(joint, "parent", link=parent)
     ElementTree.SubElement(joint, "child", link=PAYLOAD)
-    center = np.array(spec.tip_offset) + turned(*spec.tip_rotation) @ np.array(
-        payload.centre
-    )
-    ElementTree.SubElement(
-        joint,
-        "origin",
-        xyz=numbers_text(center.tolist()),
-        rpy=numbers_text(spec.tip_rotation),
-    )
+    offset = turned(*spec.tip_rotation) @ np.array(payload.centre)
+    xyz = numbers_text((np.array(spec.tip_offset) + offset).tolist())
+    rpy = numbers_text(spec.tip_rotation)
+    ElementTree.SubElement(joint, "origin", xyz=xyz, rpy=rpy)
     return link, joint

@@ -58,30 +58,7 @@ def checked_arguments(function: Callable[P, R]) -> Callable[P, R]:
     a ``CnpgenError``, the types of all arguments are compared with the annotations, and
     the first wrong one becomes a UsageError.
     """
-
-    @functools.cache
-    def prepared() -> tuple[tuple[str, ...], dict[str, Check], dict[str, Check]]:
-        """Return the positional parameters, their checks before the call, and those after an error."""
-        parameters = inspect.signature(function).parameters.values()
-        # Positional arguments are matched with their names, keywords have theirs.
-        names = tuple(
-            p.name
-            for p in parameters
-            if p.kind in {p.POSITIONAL_ONLY, p.POSITIONAL_OR_KEYWORD}
-        )
-        annotations = {
-            p.name: p.annotation
-            for p in parameters
-            if p.kind != p.VAR_KEYWORD and p.annotation != p.empty
-        }
-        hints = {name: _evaluated(function, hint) for name, hint in annotations.items()}
-        found = {name: _check_of(hint) for name, hint in hints.items()}
-        late = {name: check for name, check in found.items() if check is not None}
-        return (
-            names,
-            {name: check for name, check in late.items() if _is_first(hints[name])},
-            late,
-        )
+    prepared = functools.cache(functools.partial(_checks_of, function))
 
     @functools.wraps(function)
     def call(*args: P.args, **keywords: P.kwargs) -> R:
@@ -104,6 +81,29 @@ def checked_arguments(function: Callable[P, R]) -> Callable[P, R]:
             raise
 
     return call
+
+
+def _checks_of(
+    function: Callable[..., Any],
+) -> tuple[tuple[str, ...], dict[str, Check], dict[str, Check]]:
+    """Return the positional parameters, their checks before the call, and those after an error."""
+    parameters = inspect.signature(function).parameters.values()
+    # Positional arguments are matched with their names, keywords have theirs.
+    names = tuple(
+        p.name
+        for p in parameters
+        if p.kind in {p.POSITIONAL_ONLY, p.POSITIONAL_OR_KEYWORD}
+    )
+    annotations = {
+        p.name: p.annotation
+        for p in parameters
+        if p.kind != p.VAR_KEYWORD and p.annotation != p.empty
+    }
+    hints = {name: _evaluated(function, hint) for name, hint in annotations.items()}
+    found = {name: _check_of(hint) for name, hint in hints.items()}
+    late = {name: check for name, check in found.items() if check is not None}
+    first = {name: check for name, check in late.items() if _is_first(hints[name])}
+    return names, first, late
 
 
 def _run(

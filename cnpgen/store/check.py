@@ -1,7 +1,8 @@
 """Shallow check of a dataset: every file exists, is undamaged and fits the specification. No sample is recomputed."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -125,61 +126,30 @@ def _check_manifest(
 
     Return also the manifest, empty if it is not valid.
     """
+    finding = partial(Finding, MANIFEST, hint=REMAKE_HINT)
     if not (folder / MANIFEST).exists():
         summary = summarize_dataset(folder, spec, allow_incomplete=True)
-        return [
-            Finding(
-                MANIFEST,
-                f"is missing: the dataset is {unfinished(summary)}",
-                hint=REMAKE_HINT,
-            )
-        ], {}
+        return [finding(f"is missing: the dataset is {unfinished(summary)}")], {}
     try:
         manifest = load_manifest(folder)
     except DatasetError as error:
-        return [
-            Finding(MANIFEST, _reason(error, folder / MANIFEST), hint=REMAKE_HINT)
-        ], {}
+        return [finding(_reason(error, folder / MANIFEST))], {}
     if manifest["specification_fingerprint"] != spec.fingerprint:
-        return [
-            Finding(
-                MANIFEST,
-                f"is of another specification than {SPECIFICATION}",
-                hint=REMAKE_HINT,
-            )
-        ], {}
+        return [finding(f"is of another specification than {SPECIFICATION}")], {}
     if not lists_shards_of(manifest, spec):
-        return [
-            Finding(
-                MANIFEST, f"lists other shards than {SPECIFICATION}", hint=REMAKE_HINT
-            )
-        ], {}
-    entries, findings = shard_entries(manifest), []
+        return [finding(f"lists other shards than {SPECIFICATION}")], {}
+    entries, findings = shard_entries(manifest).items(), []
     # The manifest may be intact by its own checksum and still list shards of another
     # run.
-    if (
-        data_fingerprint((file, entry["sha256"]) for file, entry in entries.items())
-        != manifest["fingerprint"]
-    ):
-        findings.append(
-            Finding(
-                MANIFEST,
-                "its fingerprint is not that of the shards it lists",
-                hint=REMAKE_HINT,
-            )
-        )
+    listed = data_fingerprint((file, entry["sha256"]) for file, entry in entries)
+    if listed != manifest["fingerprint"]:
+        findings.append(finding("its fingerprint is not that of the shards it lists"))
     # Descriptions are listed only if an add-on wrote them.
     for name in (name for name in LISTED if name in manifest["files"]):
         entry = manifest["files"][name]
         if name == CROISSANT and not (folder / name).exists():
-            findings.append(
-                Finding(
-                    name,
-                    "is missing, as in published datasets",
-                    note=True,
-                    hint=REMAKE_HINT,
-                )
-            )
+            text = "is missing, as in published datasets"
+            findings.append(Finding(name, text, note=True, hint=REMAKE_HINT))
         else:
             findings += _check_file(folder, name, entry["sha256"], entry["bytes"])
     return findings, manifest
@@ -298,25 +268,7 @@ def check_content(folder: Path, spec: DatasetSpec, task: ShardTask) -> list[Find
         for name, value in expected.items()
         if attributes.get(name) != value
     ]
-    # Arrays of scenes are stored beside the fields of samples.
-    names = {field.name for field in spec.fields} | {
-        item.name for item in SCENE_ARRAYS if spec.scene_obstacles
-    }
-    problems += [f"lacks the field {name!r}" for name in sorted(names - schema.keys())]
-    problems += [
-        f"has an unknown field {name!r}" for name in sorted(schema.keys() - names)
-    ]
-    for field in spec.fields:
-        if field.name in schema:
-            problems += _check_field(field, schema[field.name], spec, task)
-    expected_scenes = (
-        scene_attributes(spec.scene_families) if spec.scene_obstacles else {}
-    )
-    problems += [
-        f"{name} has the attributes {schema[name].attributes}, expected {expected}"
-        for name, expected in expected_scenes.items()
-        if name in schema and schema[name].attributes != expected
-    ]
+    problems += _check_fields(schema, spec, task)
     if not problems:
         # The description is that of the specification.
         try:
@@ -324,6 +276,28 @@ def check_content(folder: Path, spec: DatasetSpec, task: ShardTask) -> list[Find
         except DatasetError as error:
             problems = [_reason(error, path)]
     return [Finding(task.file, problem, hint=DELETE_HINT) for problem in problems]
+
+
+def _check_fields(
+    schema: Mapping[str, StoredField], spec: DatasetSpec, task: ShardTask
+) -> list[str]:
+    """Compare the fields and the arrays of scenes in a shard with the specification."""
+    # Arrays of scenes are stored beside the fields of samples.
+    arrays = scene_attributes(spec.scene_families) if spec.scene_obstacles else {}
+    names = {field.name for field in spec.fields}.union(
+        item.name for item in SCENE_ARRAYS if spec.scene_obstacles
+    )
+    problems = [f"lacks the field {name!r}" for name in sorted(names - schema.keys())]
+    unknown = sorted(schema.keys() - names)
+    problems += [f"has an unknown field {name!r}" for name in unknown]
+    for field in spec.fields:
+        if field.name in schema:
+            problems += _check_field(field, schema[field.name], spec, task)
+    return problems + [
+        f"{name} has the attributes {schema[name].attributes}, expected {expected}"
+        for name, expected in arrays.items()
+        if name in schema and schema[name].attributes != expected
+    ]
 
 
 def _check_field(

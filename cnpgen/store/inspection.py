@@ -102,14 +102,8 @@ class Inspection:
         spec = self.spec
         content = {
             "folder": self.folder,
-            **{
-                name: getattr(spec, name)
-                for name in ("name", "version", "title", "license")
-            },
-            **{
-                name: getattr(self, name)
-                for name in ("complete", "state", "bytes", "seconds")
-            },
+            **_attributes(spec, "name", "version", "title", "license"),
+            **_attributes(self, "complete", "state", "bytes", "seconds"),
             "damage": [*self.summary.problems, *self.damage]
             if self.is_finalized
             else [],
@@ -130,16 +124,8 @@ class Inspection:
             "densities": densities_to_json(self.sampling.densities),
             "verification": self.sampling.verification,
             "seed": str(spec.seed),
-            **{
-                name: getattr(spec, name)
-                for name in (
-                    "generator",
-                    "backend",
-                    "dtype",
-                    "shard_size",
-                    "recipe_sha256",
-                )
-            },
+            **_attributes(spec, "generator", "backend", "dtype"),
+            **_attributes(spec, "shard_size", "recipe_sha256"),
             "specification_fingerprint": spec.fingerprint,
             "versions": spec.versions,
             "environments": self.environments,
@@ -160,7 +146,7 @@ class Inspection:
             "valid_min",
             "valid_max",
         )
-        content = {name: getattr(field, name) for name in names}
+        content = _attributes(field, *names)
         item = self.statistics.get(field.name)
         if item is None:
             return content
@@ -170,6 +156,10 @@ class Inspection:
             "max": item.maximum,
             "std": item.std,
         }
+
+
+def _attributes(item: object, *names: str) -> dict[str, Any]:
+    return {name: getattr(item, name) for name in names}
 
 
 def _yield(sampling: SamplingStatistics) -> dict[str, Any]:

@@ -167,28 +167,12 @@ def commit_shard(
     if is_committed(folder, spec, task):
         # Another process made the same shard.
         return load_record(folder, task)
-    if scenes is not None:
-        check_scenes(
-            scenes, spec.scene_obstacles, columns[SCENE_ID], len(spec.scene_families)
-        )
-    path, attributes = folder / task.file, shard_attributes(spec, task)
-    families, work = spec.scene_families, folder / WORK
     try:
-        size = write_shard(
-            path,
-            columns,
-            spec.fields,
-            attributes,
-            dtype=spec.dtype,
-            scenes=scenes,
-            families=families,
-            work=work,
-        )
         record = ShardRecord(
             file=task.file,
-            bytes=size,
+            bytes=_write(folder, spec, task, columns, scenes),
             # The sha256 is that of the file as the disk returns it, not of the buffer.
-            sha256=file_sha256(path),
+            sha256=file_sha256(folder / task.file),
             rows=task.rows,
             first_sample_id=task.first_row,
             specification_fingerprint=spec.version_with(task).fingerprint,
@@ -203,11 +187,33 @@ def commit_shard(
             save_record(folder, task, record)
             return record
     except CnpgenError:
-        # Another process may have committed the shard, finished the dataset and removed
-        # all temporary files.
+        # Another process may have finished the dataset and removed temporary files.
         if not is_committed(folder, spec, task):
             raise
     return load_record(folder, task)
+
+
+def _write(
+    folder: Path,
+    spec: DatasetSpec,
+    task: ShardTask,
+    columns: Mapping[str, NDArray[Any]],
+    scenes: SceneTable | None,
+) -> int:
+    """Check the scenes, write a shard, and return its number of bytes."""
+    families = spec.scene_families
+    if scenes is not None:
+        check_scenes(scenes, spec.scene_obstacles, columns[SCENE_ID], len(families))
+    return write_shard(
+        folder / task.file,
+        columns,
+        spec.fields,
+        shard_attributes(spec, task),
+        dtype=spec.dtype,
+        scenes=scenes,
+        families=families,
+        work=folder / WORK,
+    )
 
 
 def load_committed(folder: Path, spec: DatasetSpec, task: ShardTask) -> ShardRecord:

@@ -6,6 +6,7 @@ Determine its number of steps.
 import math
 import time
 from dataclasses import asdict, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -16,7 +17,7 @@ from cnpgen.losses.margins import Margins, suggested_margins
 from cnpgen.losses.metric import Metric, suggested_weights
 from cnpgen.losses.plan_loss import PlanLoss
 from cnpgen.machine.versions import __version__
-from cnpgen.planner.control_points import make_projection
+from cnpgen.planner.control_points import Projection, make_projection
 from cnpgen.planner.inference_pipeline import (
     InferencePipeline,
     LoadedProblem,
@@ -74,15 +75,62 @@ def prepare_run(
     """
     problems = source.training()
     boundary = problems.boundary
-    zero, fixed = zero_conditions(boundary), boundary.fixed_at_goal
-    config = settings.config
+    zero = zero_conditions(boundary)
+    config, blocks, features = _inputs(loaded, settings, boundary, initial_model)
+    inference = _inference(loaded, config, boundary, zero, blocks)
+    architecture = _architecture(loaded, settings, blocks, boundary)
+    if initial_model is not None:
+        _check_initial_model(initial_model, architecture, settings, loaded, zero)
+    rows, features = _rows(problems, inference, blocks, features, initial_model)
+    rows = _with_demonstrations(rows, source, loaded) if settings.imitation else rows
+    make_model = partial(
+        Model,
+        problem=loaded.record,
+        architecture=architecture,
+        features=features,
+        config=config,
+        zero_conditions=zero,
+        training=_record(source, settings, command, rows, initial_model),
+    )
+    loss, held_out = _loss(loaded, settings), source.checked(check_rows)
+    spec, along = loaded.problem.trajectory, inference.prepare.along
+    projection = _projection(loaded, settings, boundary.fixed_at_goal)
+    run = Run(
+        Learner(architecture, spec, loss, settings, projection, along, features),
+        names=loss.terms,
+        budgets=dict(zip(loss.terms[1:], loss.budgets.tolist(), strict=True)),
+        rows=rows,
+        metric=_metric(loss, settings),
+        model=lambda values: make_model(parameters=values.astype(np.float32)),
+        validate=lambda model: validate(model, inference, held_out),
+        initial_parameters=None if initial_model is None else initial_model.parameters,
+    )
+    return run, inference
+
+
+def _inputs(
+    loaded: LoadedProblem,
+    settings: TrainingSettings,
+    boundary: Boundary,
+    initial_model: Model | None,
+) -> tuple[ModelConfig, tuple[str, ...], Features | None]:
+    """Return the configuration of the models, the blocks of features, and the features if the rows do not define them."""
     if initial_model is None:
-        blocks, features = _initial_features(loaded, settings, boundary)
-    else:
-        # Features and via points belong to the parameters that the run starts from.
-        config = replace(config, via_points=initial_model.config.via_points)
-        blocks, features = initial_model.features.blocks, initial_model.features
-    inference = make_inference_pipeline(
+        return settings.config, *_initial_features(loaded, settings, boundary)
+    # Features and via points belong to the parameters that the run starts from.
+    config = replace(settings.config, via_points=initial_model.config.via_points)
+    return config, initial_model.features.blocks, initial_model.features
+
+
+def _inference(
+    loaded: LoadedProblem,
+    config: ModelConfig,
+    boundary: Boundary,
+    zero: tuple[str, ...],
+    blocks: tuple[str, ...],
+) -> InferencePipeline:
+    fixed = boundary.fixed_at_goal
+    return make_inference_pipeline(
         loaded,
         config,
         # Only motions from rest to rest may be slowed without a change of their ends.
@@ -90,70 +138,42 @@ def prepare_run(
         fixed_at_goal=fixed,
         observed=SCENE in blocks,
     )
-    architecture = _architecture(loaded, settings, blocks, boundary)
-    if initial_model is not None:
-        _check_initial_model(initial_model, architecture, settings, loaded, zero)
+
+
+def _rows(
+    problems: TrainingProblems,
+    inference: InferencePipeline,
+    blocks: tuple[str, ...],
+    features: Features | None,
+    initial_model: Model | None,
+) -> tuple[Rows, Features]:
+    """Prepare the rows, along the lines of an initial model that has via points."""
 
     def planned_lines(boundary: Boundary) -> Tasks:
         assert initial_model is not None
         return inference.planned(initial_model, boundary)[0]
 
-    lines = (
-        None if initial_model is None or inference.via_points is None else planned_lines
-    )
-    poses = problems.obstacle_poses
-    rows, features = prepare_rows(
-        boundary,
+    has_lines = initial_model is not None and inference.via_points is not None
+    return prepare_rows(
+        problems.boundary,
         inference.prepare,
         features=features,
         blocks=blocks,
-        lines=lines,
-        obstacle_poses=poses,
+        lines=planned_lines if has_lines else None,
+        obstacle_poses=problems.obstacle_poses,
     )
-    if settings.imitation:
-        rows = _with_demonstrations(rows, source, loaded)
-    loss = _loss(loaded, settings)
-    held_out = source.checked(check_rows)
-    training = {
-        "command": command,
-        **identity(source, settings),
-        "stages": source.stages,
-        "input_ranges": input_ranges(rows.features, initial_model),
-    }
-    projection = make_projection(
+
+
+def _projection(
+    loaded: LoadedProblem, settings: TrainingSettings, fixed_at_goal: int
+) -> Projection | None:
+    return make_projection(
         loaded.problem.for_planning,
         loaded.kernels,
         steps=settings.projection_steps,
-        fixed_at_goal=fixed,
+        fixed_at_goal=fixed_at_goal,
         within_limits=settings.within_limits,
     )
-    run = Run(
-        learner=Learner(
-            architecture,
-            loaded.problem.trajectory,
-            loss,
-            settings,
-            projection,
-            inference.prepare.along,
-            features,
-        ),
-        names=loss.terms,
-        budgets=dict(zip(loss.terms[1:], loss.budgets.tolist(), strict=True)),
-        rows=rows,
-        metric=_metric(loss, settings),
-        model=lambda parameters: Model(
-            problem=loaded.record,
-            architecture=architecture,
-            parameters=parameters.astype(np.float32),
-            features=features,
-            config=config,
-            zero_conditions=zero,
-            training=training,
-        ),
-        validate=lambda model: validate(model, inference, held_out),
-        initial_parameters=None if initial_model is None else initial_model.parameters,
-    )
-    return run, inference
 
 
 def _initial_features(
@@ -177,6 +197,22 @@ def identity(source: TrainingData, settings: TrainingSettings) -> dict[str, Any]
         "cnpgen": __version__,
         "dataset": source.describe(),
         "settings": plain(asdict(settings)),
+    }
+
+
+def _record(
+    source: TrainingData,
+    settings: TrainingSettings,
+    command: str,
+    rows: Rows,
+    initial_model: Model | None,
+) -> dict[str, Any]:
+    """Return what a model's file states of its run; JSON-able."""
+    return {
+        "command": command,
+        **identity(source, settings),
+        "stages": source.stages,
+        "input_ranges": input_ranges(rows.features, initial_model),
     }
 
 

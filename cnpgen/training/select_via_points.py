@@ -64,14 +64,12 @@ def with_via_points(
         )
         lower, upper = loaded.robot.position_lower, loaded.robot.position_upper
     motion, satisfied = _planned(model, inference, boundary)
-    on_plans = (
-        motion[np.flatnonzero(satisfied)].at(VIA_PHASES).q.reshape(-1, len(lower))
-    )
+    on_plans = motion[np.flatnonzero(satisfied)].at(VIA_PHASES).q
+    on_plans = on_plans.reshape(-1, len(lower))
     on_plans = on_plans[random.permutation(len(on_plans))[: CONFIGURATIONS_TRIED // 2]]
     n_random = CONFIGURATIONS_TRIED - len(on_plans)
-    candidates = np.concatenate(
-        [random.uniform(lower, upper, (n_random, len(lower))), on_plans]
-    )
+    others = random.uniform(lower, upper, (n_random, len(lower)))
+    candidates = np.concatenate([others, on_plans])
     # Each candidate is judged by the plans that it repairs.
     violating = boundary[np.flatnonzero(~satisfied)[:MAX_VIOLATING_PLANS]]
     repaired = [
@@ -79,10 +77,8 @@ def with_via_points(
         for q in candidates
     ]
     selected = candidates[_greedy_cover(np.array(repaired), count)]
-    return replace(
-        model,
-        config=replace(model.config, via_points=tuple(map(tuple, selected.tolist()))),
-    )
+    config = replace(model.config, via_points=tuple(map(tuple, selected.tolist())))
+    return replace(model, config=config)
 
 
 def _planned(

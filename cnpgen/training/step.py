@@ -107,20 +107,12 @@ class Learner:
         clipping: Clipping,
         out: AnyArray,
     ) -> AnyArray:
-        network, scale, part = (
-            self.architecture.split(parameters),
-            self.settings.path_scale,
-            out,
-        )
+        network, scale = self.architecture.split(parameters), self.settings.path_scale
+        part = out
         for iteration in range(self.settings.iterations):
             activations = forward(network, rows.features)
-            points = control_points(
-                rows.tasks,
-                activations.path,
-                activations.log_rate,
-                scale=scale,
-                spec=self.spec,
-            )
+            outputs = activations.path, activations.log_rate
+            points = control_points(rows.tasks, *outputs, scale=scale, spec=self.spec)
             projected = self._projected(points, rows)
             value = cost(rows, projected)
             phi, log_rate = self._output_gradients(rows, points, value)

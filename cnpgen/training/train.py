@@ -14,6 +14,7 @@ from cnpgen.planner.inference_pipeline import loaded_problem
 from cnpgen.planner.model import Model
 from cnpgen.planner.model_file import find_model, load_model, save_model
 from cnpgen.problems.problem_record import (
+    ProblemRecord,
     as_record,
     with_control_points,
     with_objective,
@@ -26,7 +27,7 @@ from cnpgen.store.files.documents import differences, plain
 from cnpgen.store.files.file_lock import output_lock
 from cnpgen.store.files.leftovers import remove_leftovers_of
 from cnpgen.training.checkpoint import Checkpoints, State
-from cnpgen.training.data import open_training_data
+from cnpgen.training.data import TrainingData, open_training_data
 from cnpgen.training.log import TrainingLog, is_log
 from cnpgen.training.prepare import begin_run, identity, prepare_run, validate
 from cnpgen.training.settings import Length, TrainingSettings
@@ -119,66 +120,103 @@ def train_model(
     check_out(out)
     remove_temporary_files(out)
     source = open_training_data(folder, chosen.robot)
-    initial_model, digest = _read_initial_model(start_from)
-    run_identity = {
-        "length": plain(passed),
-        "check_rows": check_rows,
-        "start_from": digest,
-    }
-    checkpoints = Checkpoints(
-        out.with_suffix(CHECKPOINT), identity(source, settings) | run_identity
-    )
+    model, digest = _read_initial_model(start_from)
+    own = {"length": plain(passed), "check_rows": check_rows, "start_from": digest}
+    run_identity = identity(source, settings) | own
+    checkpoints = Checkpoints(out.with_suffix(CHECKPOINT), run_identity)
     if not force:
         # A checkpoint is removed after its model is saved: without one the run is
         # finished.
         if out.exists() and not checkpoints.path.exists():
             return _finished(out, checkpoints.identity)
         check_beside(out)
-    record = with_control_points(
-        as_record(source.problem),
-        settings.path_control_points,
-        settings.rate_control_points,
+    request = _TrainingRequest(
+        out, source, settings, length, model, check_rows, checkpoints
     )
-    record = with_objective(record, settings.objective)
+    return _train(request, chosen, clock, force=force, workers=workers)
+
+
+@dataclass(frozen=True)
+class _TrainingRequest:
+    """Checked arguments of a training that is not finished."""
+
+    out: Path
+    source: TrainingData
+    settings: TrainingSettings
+    length: Length
+    initial_model: Model | None
+    check_rows: int
+    checkpoints: Checkpoints
+
+    def record(self) -> ProblemRecord:
+        """Return the problem with the control points and the objective of the settings."""
+        settings = self.settings
+        record = with_control_points(
+            as_record(self.source.problem),
+            settings.path_control_points,
+            settings.rate_control_points,
+        )
+        return with_objective(record, settings.objective)
+
+
+def _train(
+    request: _TrainingRequest,
+    options: TrainingOptions,
+    clock: Stopwatch,
+    *,
+    force: bool,
+    workers: int | None,
+) -> Trained:
+    """Train from the checkpoint or from the start, and save the best model."""
+    out, checkpoints = request.out, request.checkpoints
     with (
         output_lock(out, out.with_suffix(LOCK)),
         one_thread(),
-        loaded_problem(record) as loaded,
+        loaded_problem(request.record()) as loaded,
     ):
         run, inference = prepare_run(
-            source,
+            request.source,
             loaded,
-            settings,
-            initial_model=initial_model,
-            check_rows=check_rows,
-            command=chosen.command,
+            request.settings,
+            initial_model=request.initial_model,
+            check_rows=request.check_rows,
+            command=options.command,
         )
         # The checkpoint is read after the kernels: their compilation may raise errors,
         # too.
-        state = checkpoints.load(discard=force) or begin_run(run, length)
+        state = checkpoints.load(discard=force) or begin_run(run, request.length)
         clock.prepared()
-        if chosen.begin is not None:
-            chosen.begin(state, run)
+        if options.begin is not None:
+            options.begin(state, run)
         log = TrainingLog(out.with_suffix(LOG), state.log)
-        run.train(state, checkpoints, log, chosen.watch)
+        run.train(state, checkpoints, log, options.watch)
         checkpoints.save(state)
         best = run.model(state.best.parameters)
         # Other rows than those that selected the best model, so that the score has no
         # selection bias.
-        score = validate(
-            best,
-            inference,
-            source.judged(MAX_SCORED_ROWS, after=check_rows),
-            workers=workers,
-        )
-        # The checkpoint lacks this line, so that it is written once.
-        log.write({"step": state.adam.step, "best": state.best.step, "final": score})
-        training = {**best.training, **checkpoints.identity, **_outcome(state, score)}
-        model = replace(best, log=log.text, training=training)
-        save_model(out, model)
-        checkpoints.remove()
+        rows = request.source.judged(MAX_SCORED_ROWS, after=request.check_rows)
+        score = validate(best, inference, rows, workers=workers)
+        model = _save(best, request, state, log, score)
     clock.computed_here()
     return Trained(model, out, score, times=clock.times())
+
+
+def _save(
+    best: Model,
+    request: _TrainingRequest,
+    state: State,
+    log: TrainingLog,
+    score: Mapping[str, Any],
+) -> Model:
+    """Save the best model with its log and its score in place of the checkpoint; return it."""
+    # The checkpoint lacks this line, so that it is written once.
+    log.write({"step": state.adam.step, "best": state.best.step, "final": score})
+    identity_of_run = request.checkpoints.identity
+    training = {**best.training, **identity_of_run, **_outcome(state, score)}
+    model = replace(best, log=log.text, training=training)
+    save_model(request.out, model)
+    request.checkpoints.remove()
+    return model
 
 
 def _read_initial_model(
@@ -250,5 +288,6 @@ def check_beside(out: Path) -> None:
 
 def remove_temporary_files(out: Path) -> None:
     """Remove the temporary files of killed runs."""
-    for path in (out, *(out.with_suffix(suffix) for suffix in (CHECKPOINT, LOG))):
+    beside = (out.with_suffix(suffix) for suffix in (CHECKPOINT, LOG, PICTURE))
+    for path in (out, *beside):
         remove_leftovers_of(path)

@@ -74,37 +74,27 @@ def prepare_rows(
         for first in range(0, max(len(boundary), 1), PREPARED_ROWS_PER_BLOCK)
     ]
     # Features do not depend on the projected line, which takes most of the time.
-    straight = replace(prepare, line=None)
-    placed = bool(prepare.placed)
+    straight, placed = replace(prepare, line=None), bool(prepare.placed)
     poses = [None if obstacle_poses is None else obstacle_poses[part] for part in parts]
+    pairs = list(zip(parts, poses, strict=True))
     definition = features or fit_features(
-        (
-            straight(boundary[part], obstacle_poses=own)
-            for part, own in zip(parts, poses, strict=True)
-        ),
+        (straight(boundary[part], obstacle_poses=own) for part, own in pairs),
         blocks or feature_blocks(boundary, placed=placed),
     )
     arrays: dict[str, AnyArray] = {}
-    for part, own in zip(parts, poses, strict=True):
-        tasks = (
-            prepare(boundary[part], obstacle_poses=own)
-            if lines is None
-            else lines(boundary[part])
-        )
+    for part, own in pairs:
+        rows = boundary[part]
+        tasks = prepare(rows, obstacle_poses=own) if lines is None else lines(rows)
         for name, values in _arrays(tasks, definition, dtype).items():
             if name not in arrays:
                 arrays[name] = np.empty((len(boundary), *values.shape[1:]), dtype)
             arrays[name][part] = values
     ends = Boundary(**{name: arrays.pop(name) for name in boundary.arrays()})
-    row_features, scene = (
-        arrays.pop("features"),
-        Scene(tuple(prepare.problem.obstacle), arrays.pop("poses")),
-    )
+    row_features = arrays.pop("features")
+    scene = Scene(tuple(prepare.problem.obstacle), arrays.pop("poses"))
     obstacles = Scene(prepare.placed, arrays.pop("placed")) if placed else None
-    return Rows(
-        features=row_features,
-        tasks=Tasks(ends, scene=scene, placed=obstacles, **arrays),
-    ), definition
+    tasks = Tasks(ends, scene=scene, placed=obstacles, **arrays)
+    return Rows(tasks, row_features), definition
 
 
 def _arrays(tasks: Tasks, features: Features, dtype: str) -> dict[str, AnyArray]:

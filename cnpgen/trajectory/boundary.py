@@ -199,10 +199,8 @@ def boundary_of(  # noqa: PLR0917 - in the order of the paper
     conditions = start_q, start_dq, start_ddq, goal_q, goal_dq, goal_ddq
     if parameters is None and (one := _one_motion(n, conditions)) is not None:
         return one
-    arguments = {
-        entry.name: values
-        for entry, values in zip(fields(Boundary), conditions, strict=False)
-    }
+    pairs = zip(fields(Boundary), conditions, strict=False)
+    arguments = {entry.name: values for entry, values in pairs}
     # Missing derivatives are zero, a missing goal acceleration is free.
     arrays = {
         name: _rows(name, values, n)
@@ -211,27 +209,19 @@ def boundary_of(  # noqa: PLR0917 - in the order of the paper
     }
     if parameters is not None:
         values = numbers("parameters", parameters)
-        arrays["parameters"] = _rows(
-            "parameters", values, values.shape[-1] if values.ndim else 0
-        )
+        width = values.shape[-1] if values.ndim else 0
+        arrays["parameters"] = _rows("parameters", values, width)
     # Conditions of one row are repeated for all motions.
     rows = max(len(values) for values in arrays.values())
     for name, values in arrays.items():
         if len(values) not in {1, rows}:
-            raise UsageError(
-                f"has {len(values)} rows, another boundary condition has {rows}",
-                argument=name,
-            )
+            text = f"has {len(values)} rows, another boundary condition has {rows}"
+            raise UsageError(text, argument=name)
     check_memory_of_rows({name: len(values) for name, values in arrays.items()}, 6 * n)
     if goal_ddq is None:
         del arguments["goal_ddq"]
-    zero = np.zeros((1, n))
-    return Boundary(
-        **{
-            name: _repeated(arrays.get(name, zero), rows)
-            for name in {**arguments, **arrays}
-        }
-    )
+    zero, names = np.zeros((1, n)), {**arguments, **arrays}
+    return Boundary(**{name: _repeated(arrays.get(name, zero), rows) for name in names})
 
 
 def _one_motion(n: int, conditions: Sequence[ArrayLike | None]) -> Boundary | None:

@@ -269,38 +269,32 @@ def validate_dataset(
         MachineError: A file cannot be read, or blocks are to be regenerated and the
             backend of the dataset does not work on this machine.
     """
-    regenerate, machine_engine = (
-        integer("regenerate", regenerate, least=0),
-        Engine(engine, address, workers),
-    )
+    regenerate = integer("regenerate", regenerate, least=0)
+    machine_engine = Engine(engine, address, workers)
     folder = require_dataset(folder)
     findings = check_dataset(folder)
     try:
         spec = load_dataset_spec(folder)
     except DatasetError:
         return ValidationReport(folder, 0, tuple(findings))
+    # Missing packages and backends, and a recipe that cannot be restored, are reported
+    # before the expensive checks.
     if regenerate:
-        # Missing packages and backends are reported before the expensive checks.
         backend_of(folder, spec)
     if deep or regenerate:
-        # A recipe that cannot be restored is reported before the expensive checks.
         with restored(spec):
             pass
     existing = [task for task in shards(spec) if is_committed(folder, spec, task)]
     damaged = {finding.file for finding in findings if not finding.note}
     # A damaged shard is a finding already; HDF5 may hang on it.
     undamaged = [task for task in existing if task.file not in damaged]
-    findings += check_recipe(spec) + (check_statistics(folder, spec) if deep else [])
-    checked = (
-        check_rows(folder, spec, undamaged, machine_engine, progress)
-        if deep
-        else DeepCheck()
-    )
-    again = (
-        regenerate_blocks(folder, spec, undamaged, regenerate)
-        if regenerate
-        else Regeneration()
-    )
+    findings += check_recipe(spec)
+    checked, again = DeepCheck(), Regeneration()
+    if deep:
+        findings += check_statistics(folder, spec)
+        checked = check_rows(folder, spec, undamaged, machine_engine, progress)
+    if regenerate:
+        again = regenerate_blocks(folder, spec, undamaged, regenerate)
     return ValidationReport(
         folder,
         sum(task.rows for task in existing),

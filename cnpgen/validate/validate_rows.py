@@ -104,6 +104,9 @@ class _ShardCheck:
     goals: NDArray[np.uint64]
 
 
+_END_COLUMNS = ("start_q", "start_dq", "start_ddq", "goal_q", "goal_dq")
+
+
 def _verify_shard(folder: Path, spec: DatasetSpec, task: ShardTask) -> _ShardCheck:
     """Verify one shard; a shard that cannot be read is a finding, not an exception."""
     try:
@@ -112,23 +115,16 @@ def _verify_shard(folder: Path, spec: DatasetSpec, task: ShardTask) -> _ShardChe
         columns = read_checked(shard)
         scenes = read_scenes(shard) if spec.scene_obstacles else None
     except CnpgenError as error:
-        return _ShardCheck(
-            None,
-            [str(error)],
-            np.empty(0, np.uint64),
-            PlanCheck(),
-            np.empty(0),
-            np.empty(0, np.uint64),
-        )
+        none = np.empty(0, np.uint64)
+        return _ShardCheck(None, [str(error)], none, PlanCheck(), np.empty(0), none)
     with restored(spec) as recipe:
         problem = recipe.pipeline.problem
         robot = load_robot(problem)
         if scenes is not None:
             table = scenes[scenes.rows_of(columns[SCENE_ID])]
             columns[OBSTACLE_POSES] = scene_poses(problem.obstacle, table)
-        report = verify_rows(
-            problem, robot, columns, dtype=spec.dtype, rule=hit_rule(spec.stages)
-        )
+        rule = hit_rule(spec.stages)
+        report = verify_rows(problem, robot, columns, dtype=spec.dtype, rule=rule)
         plans = check_plans(problem, robot, columns)
     problems = [*plans.problems, *check_numbers(spec, task, columns, record)]
     problems += [
@@ -136,25 +132,12 @@ def _verify_shard(folder: Path, spec: DatasetSpec, task: ShardTask) -> _ShardChe
         f" (allowed {check.tolerance:.3g}) in row {task.first_row + check.worst_row}"
         for check in report.failed
     ]
-    ends = [
-        columns[name]
-        for name in ("start_q", "start_dq", "start_ddq", "goal_q", "goal_dq")
-        if name in columns
-    ]
-    fractions = (
-        speed_fractions(columns)
-        if {"hit_speed", "hit_speed_max"} <= columns.keys()
-        else np.empty(0)
-    )
+    ends = [columns[name] for name in _END_COLUMNS if name in columns]
+    is_hit = {"hit_speed", "hit_speed_max"} <= columns.keys()
+    fractions = speed_fractions(columns) if is_hit else np.empty(0)
     goals = row_keys(columns["goal_q"])[: len(fractions)]
-    return _ShardCheck(
-        report,
-        problems,
-        row_keys(np.concatenate(ends, axis=1)),
-        plans,
-        fractions,
-        goals,
-    )
+    keys = row_keys(np.concatenate(ends, axis=1))
+    return _ShardCheck(report, problems, keys, plans, fractions, goals)
 
 
 def _check_speed_fractions(spec: DatasetSpec, checks: list[_ShardCheck]) -> list[str]:

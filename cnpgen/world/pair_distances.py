@@ -60,15 +60,15 @@ class PairDistances:
     bodies: Callable[[int, int], tuple[PlacedBody, PlacedBody]]
     directions: dict[int, list[Array]] = field(default_factory=dict)
 
-    def smallest(self) -> list[Array]:
-        """Measure distances [m]: arrays of shape (K,), of which the smallest value is exact."""
-        return self._searched(list(range(len(self.bounds))))
+    def smallest(self, sufficient: float = math.inf) -> list[Array]:
+        """Measure distances [m]: arrays of shape (K,), of which the smallest value is exact if it is below a distance."""
+        return self._searched(list(range(len(self.bounds))), sufficient)
 
     def smallest_of_each(self) -> list[Array]:
         """Measure distances [m]: arrays of shape (K,), of each of which the smallest value is exact."""
         return [self._searched([pair])[0] for pair in range(len(self.bounds))]
 
-    def _searched(self, pairs: list[int]) -> list[Array]:
+    def _searched(self, pairs: list[int], sufficient: float = math.inf) -> list[Array]:
         """Find the smallest distance of some pairs by best-first search.
 
         The state with the smallest bound is measured, and its separating direction
@@ -80,14 +80,15 @@ class PairDistances:
             Distances [m], one array of shape (K,) per pair. The smallest one is exact
             up to ``RESOLUTION`` and stands where it was measured; values that were not
             measured are lower bounds above it. A state that cannot be measured is nan
-            and ends the search.
+            and ends the search. It also ends when all values reach a sufficient
+            distance, which are then lower bounds.
         """
         # Start from the lower bounds: only states that may be the closest are measured.
         distances, best = self.bounds[pairs], np.inf
         measured: dict[tuple[int, int], float] = {}
         while distances.size:
             index, k = divmod(int(distances.argmin()), distances.shape[1])
-            if distances[index, k] >= best - RESOLUTION:
+            if distances[index, k] >= min(best - RESOLUTION, sufficient):
                 break
             distance, direction = self._measured(pairs[index], k)
             measured[index, k] = distance
@@ -100,7 +101,8 @@ class PairDistances:
                 distances[index, closer] = np.maximum(distances[index, closer], raised)
         # Unmeasured values stay strictly above the smallest one, which is then the only
         # minimum.
-        np.maximum(distances, math.nextafter(best, math.inf), out=distances)
+        if best - RESOLUTION <= sufficient:
+            np.maximum(distances, math.nextafter(best, math.inf), out=distances)
         for place, distance in measured.items():
             distances[place] = distance
         return list(distances)

@@ -6,6 +6,7 @@ centers [m], shape (3, K), rotation matrices, shape (3, 3, K), and edge lengths 
 shape (3,).
 """
 
+import math
 from collections.abc import Sequence
 from functools import cached_property
 
@@ -196,9 +197,14 @@ class PathWorld(RobotWorld[Array]):
             np.isfinite(self._origins).all() and np.isfinite(self.tip_position).all()
         ):
             return [np.full(self.q.shape[1], np.nan) for _ in pairs.bounds]
-        if not self._exact and (pairs.bounds >= sufficient).all():
+        sufficient = math.inf if self._exact else sufficient
+        if (pairs.bounds >= sufficient).all():
             return list(pairs.bounds)
-        return pairs.smallest_of_each() if bodies == "object" else pairs.smallest()
+        return (
+            pairs.smallest_of_each()
+            if bodies == "object"
+            else pairs.smallest(sufficient)
+        )
 
     def _from_segments(self) -> PairDistances:
         segments, solids = self.segments(), self._solids

@@ -106,7 +106,7 @@ def test_a_folder_is_compared_with_all_its_files(tmp_path: Path) -> None:
         is_finished(out, 1, force=False)
 
 
-@pytest.mark.parametrize("kind", ["deep", "pipe", "folder", "long"])
+@pytest.mark.parametrize("kind", ["deep", "pipe", "long"])
 def test_a_damaged_request_is_of_no_result(tmp_path: Path, kind: str) -> None:
     out = tmp_path / "p.h5"
     out.write_bytes(b"")
@@ -117,11 +117,20 @@ def test_a_damaged_request_is_of_no_result(tmp_path: Path, kind: str) -> None:
     file.unlink()
     if kind == "pipe":
         os.mkfifo(file)
-    elif kind == "folder":
-        file.mkdir()
     else:
         file.write_text("[" * 4000 if kind == "deep" else content + " " * 5000)
     with pytest.raises(
         UsageError, match=r"--force replaces it, -o names another file$"
     ):
         is_finished(out, 1, force=False)
+
+
+def test_a_folder_in_place_of_the_request_is_refused_before_the_work(
+    run: Run, tmp_path: Path
+) -> None:
+    request_file(tmp_path / "s.h5").mkdir()
+    for words in (SOLVE, (*SOLVE, "--force")):
+        code, _, err = run(*words)
+        assert code == 2
+        assert ".s.h5.request is a folder" in err
+        assert not (tmp_path / "s.h5").exists()

@@ -31,6 +31,7 @@ README = ROOT / "README.md"
 PAGES = [README, *sorted((ROOT / "docs").rglob("*.md"))]
 PLUG_INS = ROOT / "docs" / "how-to" / "plug-ins.md"
 RUNNABLE = {"bash", "python", "toml"}
+MAX_DIFFERENCE = 0.02  # mean over the pixels of a picture, of 1
 
 
 def output_blocks() -> ModuleType:
@@ -144,6 +145,12 @@ def test_the_blocks_of_a_page_run_in_order(
             printed = run(["bash", "-euo", "pipefail", "-c", text], tmp_path)
         elif language == "python":
             printed = run([sys.executable, "-c", text], tmp_path)
+    for drawn, picture in outputs.drawn_pictures(page, tmp_path):
+        imread = pytest.importorskip("matplotlib.image").imread
+        now, before = (imread(path) for path in (drawn, picture))
+        assert now.shape == before.shape, picture
+        difference = np.abs(now - before).mean()
+        assert difference < MAX_DIFFERENCE, f"{picture}: run docs/outputs.py"
 
 
 def test_an_output_block_shows_lines_of_the_output_in_their_order() -> None:

@@ -16,7 +16,7 @@ from tests.faults.call_fuzz import fuzz_calls
 from tests.faults.chunk_orders import run_chunk_orders
 from tests.faults.flips import flip_bits
 from tests.faults.fuzz import fuzz
-from tests.faults.kills import kill
+from tests.faults.kills import MAX_FINDINGS, kill
 from tests.faults.progress import Part, Progress, load_progress, save_progress
 from tests.faults.stop_orders import StopOutcome, run_orders, stop_at_hard_moments
 from tests.faults.subjects import SUBJECTS
@@ -89,7 +89,7 @@ class Fault:
 
 FAULTS = {
     "inputs": Fault("changed files to read", 100_000, 2_000, inputs),
-    "kills": Fault("processes to kill; their runs are resumed", 500, 50, kills),
+    "kills": Fault("processes to kill; their runs are resumed", 500, 100, kills),
     "calls": Fault("calls of public functions, wrong arguments", 5_000, 1_000, calls),
     "flips": Fault("flipped bits of files with checksums", 2_000, 500, flips),
     "stops": Fault("random orders of requests to a runtime", 100_000, 1_000, stops),
@@ -132,7 +132,7 @@ def _run(
 ) -> None:
     """Run faults of one kind in blocks until there are as many as requested."""
     fault, part = FAULTS[name], progress.parts[name]
-    while part.done < count:
+    while part.done < count and len(part.findings) < MAX_FINDINGS:
         block = min(fault.block, count - part.done)
         part.add(fault.run(block, progress.seed, part.next, kinds))
         save_progress(progress, path)

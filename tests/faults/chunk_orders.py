@@ -16,6 +16,7 @@ from cnpgen.problems.problem_record import open_problem, record_problem
 from tests.faults.stop_orders import (
     MAX_DELAY_S,
     MAX_WAIT_S,
+    SMALL_DELAY_S,
     TICK_S,
     call_in_threads,
     check_states,
@@ -25,10 +26,11 @@ from tests.faults.stop_orders import StopOutcome as Outcome
 Array = NDArray[np.float64]
 
 PROBLEM = "airhockey"  # without its table: the arm follows chunks in joint space
-N_LIMITS = 4  # constraints of position, velocity, acceleration and torque
-RATE_HZ, LENGTH = 30.0, 40
+N_LIMITS = 3  # constraints of position, velocity and acceleration
+RATE_HZ, LENGTH = 30.0, 12
 STALE_S = 0.5
-SET_POINT_STEP_S = 0.01
+SET_POINT_STEP_S = 0.02
+MAX_FIRST_SET_POINTS = 14  # at most 70 % of a chunk
 AMPLITUDE_RAD, FREQUENCY = 0.3, 1.2
 
 
@@ -60,8 +62,10 @@ class ChunkOrders:
         self._executor.reset((self._home, still))
         self._serve(1)
         assert self._step(0.0).accepted, "the first chunk is refused"
-        self._serve(int(self._random.integers(3, 40)))
-        call_in_threads(self._call, self._chosen_requests(), self._random)
+        self._serve(int(self._random.integers(2, MAX_FIRST_SET_POINTS)))
+        call_in_threads(
+            self._call, self._chosen_requests(), self._random, SMALL_DELAY_S
+        )
         assert not self._errors, self._errors[0]
         self._check()
 
@@ -117,7 +121,8 @@ class ChunkOrders:
             assert time.monotonic() < deadline, "a stop hangs"
             time.sleep(MAX_DELAY_S / 10)
         stop = runtime.stop(0.0)
-        times = np.arange(runtime.now, stop.end_time + 0.05, TICK_S)
+        end = max(stop.end_time, runtime.now)
+        times = np.arange(runtime.now, end + 0.05, TICK_S)
         before = runtime.state_at(times)
         assert not self._step(0.0).accepted, "a chunk was accepted after a stop"
         for old, new in zip(before, runtime.state_at(times), strict=True):

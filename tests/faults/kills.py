@@ -26,8 +26,13 @@ from tests.examples.tiny_datasets import digests
 
 MAX_RUN_TIME_S = 300.0  # longer runs count as hanging
 MAX_KILLS_PER_RUN = 3
+MIN_WAIT_S, MAX_WAIT_SHARE = (
+    0.2,
+    0.95,
+)  # of the shortest duration seen: a busy machine is slower
 SETTINGS = ("--shard-size", "50", "--quiet")
 SIGNALS = (signal.SIGKILL, signal.SIGKILL, signal.SIGTERM, signal.SIGINT)
+MAX_FINDINGS = 20  # then a run ends
 TARGETS = ("all", "parent", "worker")
 
 
@@ -36,7 +41,7 @@ class Kills:
     """Outcomes of killed runs.
 
     Attributes:
-        n_signals: Number of sent signals.
+        n_signals: Number of signals to a running process; one that had ended counts as none.
         n_runs: Number of runs.
         runs: Number of runs by kind and by exit code of the last killed process.
         findings: Failures, one line each.
@@ -199,7 +204,7 @@ def kill(
     """Kill runs of commands at random times, resume them, and compare the results with uninterrupted runs.
 
     Args:
-        count: Minimum number of signals.
+        count: Minimum number of signals that hit a running process.
         seed: Seed of all choices.
         first: Index of the first run.
         kinds: Commands to run.
@@ -210,23 +215,24 @@ def kill(
         uninterrupted = {
             name: _uninterrupted(KINDS[name], Path(place), name) for name in kinds
         }
+        shortest = {name: seconds for name, (_, seconds) in uninterrupted.items()}
         number = first
-        while outcome.n_signals < count:
+        while outcome.n_signals < count and len(outcome.findings) < MAX_FINDINGS:
             chosen = random.Random(f"{seed} {number}")
             name = chosen.choice(kinds)
             folder = Path(place) / f"run{number}"
             folder.mkdir()
             try:
-                n_signals, ending = _killed(
-                    KINDS[name], folder, chosen, uninterrupted[name]
+                n_signals, ending, shortest[name] = _killed(
+                    KINDS[name], folder, chosen, uninterrupted[name][0], shortest[name]
                 )
                 outcome.runs[f"{name}, {ending}"] += 1
+                outcome.runs[f"{name}, signals"] += n_signals
                 outcome.n_signals += n_signals
             except (AssertionError, subprocess.TimeoutExpired) as error:
                 outcome.findings.append(
                     f"seed {seed}, run {number}, {name}: {type(error).__name__} {error}"
                 )
-                outcome.n_signals += 1
             shutil.rmtree(folder)
             number += 1
             outcome.n_runs += 1
@@ -274,14 +280,14 @@ def _uninterrupted(kind: Kind, place: Path, name: str) -> tuple[object, float]:
 
 
 def _killed(
-    kind: Kind, folder: Path, chosen: random.Random, uninterrupted: tuple[object, float]
-) -> tuple[int, str]:
-    """Kill a run at least once and resume it; return the number of signals and the last exit code."""
+    kind: Kind, folder: Path, chosen: random.Random, expected: object, shortest: float
+) -> tuple[int, str, float]:
+    """Kill a run and resume it; return the number of signals, the last exit code and the shortest duration [s]."""
     kind.prepare(folder.parent / "shared", folder)
-    expected, seconds = uninterrupted
     n_signals = 0
     for _ in range(chosen.randint(1, MAX_KILLS_PER_RUN)):
         words = kind.words(folder, chosen.choice((1, 2)))
+        begun = time.monotonic()
         with subprocess.Popen(
             _command(words),
             start_new_session=True,
@@ -289,10 +295,11 @@ def _killed(
             stdout=-3,
         ) as process:
             with suppress(subprocess.TimeoutExpired):
-                process.wait(chosen.uniform(0.2, seconds))
+                process.wait(chosen.uniform(MIN_WAIT_S, MAX_WAIT_SHARE * shortest))
             if process.poll() is None:
-                _hit(process, chosen)
-                n_signals += 1
+                n_signals += _hit(process, chosen)
+            else:
+                shortest = min(shortest, max(time.monotonic() - begun, 2 * MIN_WAIT_S))
             code = process.wait(MAX_RUN_TIME_S)
         assert code in {
             0,
@@ -304,23 +311,16 @@ def _killed(
             -signal.SIGTERM,
             -signal.SIGINT,
         }, f"it ended with {code}"
-        if (folder / "plans.h5").exists() or _is_trained(
-            folder
-        ):  # the same command would refuse to replace them
+        if (folder / "plans.h5").exists():  # complete, but perhaps not its request
             break
     else:
         _finish(kind.words(folder, 2), kind.codes)
     assert kind.product(folder) == expected, "another result"
-    return n_signals, f"ended with {code}"
+    return n_signals, f"ended with {code}", shortest
 
 
-def _is_trained(folder: Path) -> bool:
-    """Return whether a training is complete; a run that still has its checkpoint finishes when it is resumed."""
-    return (folder / "model.h5").exists() and not (folder / "model.checkpoint").exists()
-
-
-def _hit(process: subprocess.Popen[bytes], chosen: random.Random) -> None:
-    """Send a signal to a process, to one of its workers, or to all of them."""
+def _hit(process: subprocess.Popen[bytes], chosen: random.Random) -> bool:
+    """Send a signal to a process, to one of its workers, or to all of them; return whether it arrived."""
     number, target = chosen.choice(SIGNALS), chosen.choice(TARGETS)
     workers = [pid for pid in descendants(process.pid) if "popen_loky" in _name(pid)]
     try:
@@ -331,7 +331,8 @@ def _hit(process: subprocess.Popen[bytes], chosen: random.Random) -> None:
         else:
             process.send_signal(number)
     except ProcessLookupError:  # the process has ended before
-        pass
+        return False
+    return True
 
 
 def _name(pid: int) -> str:

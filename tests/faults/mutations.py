@@ -161,7 +161,7 @@ def change_text(text: str, draw: Random) -> str:
 
 def change_json(document: Any, draw: Random) -> Any:
     """Replace, delete, add or repeat values somewhere in a document."""
-    changed = copy.deepcopy(document)
+    changed = json.loads(json.dumps(document))
     for _ in range(draw.choice((1, 1, 2))):
         places = [place for place in _places(changed) if place[1] != "format"]
         if not places:
@@ -171,9 +171,7 @@ def change_json(document: Any, draw: Random) -> Any:
         if how == 0:
             del parent[key]
         elif how == 1 and isinstance(parent, list):
-            parent.extend(
-                copy.deepcopy(parent[key]) for _ in range(draw.choice((1, 200)))
-            )
+            parent.extend([copy.deepcopy(parent[key])] * draw.choice((1, 200)))
         elif how == 2 and isinstance(parent, dict):
             parent[draw.choice(TEXTS[:-1])] = copy.deepcopy(parent[key])
         elif how == 3:

@@ -1,4 +1,4 @@
-"""Make the tapes of shipped problems that the package has as data.
+"""Make the tapes of shipped problems that the package has as data, and the shapes of their robots.
 
     python -m tests.kernels.make_shipped_tapes
 
@@ -28,6 +28,8 @@ from cnpgen.problems.load_robot import load_robot
 from cnpgen.problems.obstacles import with_capacity
 from cnpgen.problems.problem_file import load_problem
 from cnpgen.refine.refiner import Refiner
+from cnpgen.robots.shape import shape
+from cnpgen.schema.catalogue import list_recipes
 
 ROOT = Path(__file__).parents[2]
 
@@ -90,8 +92,23 @@ def write(tapes: dict[str, Tape], folder: Path) -> None:
             archive.writestr(zipfile.ZipInfo(name), contents[name], zipfile.ZIP_LZMA)
 
 
+def write_shapes(folder: Path) -> None:
+    """Compute and write the capsules and link pairs of the robots of shipped problems."""
+    with pytest.MonkeyPatch.context() as patch, tempfile.TemporaryDirectory() as cache:
+        patch.setattr(shape, "SHIPPED", None)
+        patch.setenv("CNPGEN_CACHE", cache)
+        for name in list_recipes("problem"):
+            load_robot(load_problem(name))
+        folder.mkdir(exist_ok=True)
+        for path in folder.glob("*"):
+            path.unlink()
+        for path in Path(cache).glob("shape-*.json"):
+            (folder / path.name).write_bytes(path.read_bytes())
+
+
 def main() -> None:
     """Make the files of the package."""
+    write_shapes(shape.SHIPPED)
     with recorded() as tapes:
         load_all()
     write(tapes, shipped_tapes.FOLDER)

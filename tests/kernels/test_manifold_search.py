@@ -127,6 +127,15 @@ def test_paths_end_at_the_goal(setting):
         np.testing.assert_array_equal(setting.search(seed=seed)[[0, -1]], setting.ends)
 
 
+def test_paths_end_at_one_of_several_goals(setting):
+    start, goal = setting.ends
+    goals = np.array([goal, setting.level(goal + 0.2)])
+    for seed in range(6):
+        path = setting.search(seed=seed, ends=(start, goals))
+        assert (goals == path[-1]).all(axis=1).sum() == 1
+        assert max(abs(setting.height(q) - HEIGHT_M) for q in path) < 1.5e-4
+
+
 def test_a_start_off_the_manifold_is_left(setting):
     ends = [setting.level(BESIDE_WALL[0], HEIGHT_M + 0.12), setting.ends[1]]
     path = setting.search(ends=ends)

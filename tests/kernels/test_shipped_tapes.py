@@ -1,4 +1,4 @@
-"""Tapes that the package has as data: equal to those of the present sources, found by them only, optional."""
+"""Tapes and shapes that the package has as data: equal to those of the present sources, found by them only, optional."""
 
 import json
 from collections.abc import Iterator
@@ -12,6 +12,9 @@ from cnpgen.kernels import library as library_module
 from cnpgen.kernels import shipped_tapes
 from cnpgen.kernels.library import KernelLibrary
 from cnpgen.kernels.symbolic.kinematics import tip_position
+from cnpgen.problems.load_robot import load_robot
+from cnpgen.problems.problem_file import load_problem
+from cnpgen.robots.shape import shape
 from tests.conftest import Prepare
 from tests.examples.example_robots import needs_robots
 from tests.kernels import make_shipped_tapes
@@ -46,6 +49,32 @@ def test_the_index_names_all_tapes_of_shipped_datasets_for_the_present_sources()
         assert sorted(archive.namelist()) == sorted(set(index.values()))
         for name in archive.namelist():
             assert sha256(archive.read(name)).hexdigest()[:32] == name
+
+
+@pytest.mark.slow
+@needs_robots
+def test_stored_shapes_are_those_of_the_sources(tmp_path: Path) -> None:
+    """Computed again, capsules and pairs of the robots of shipped problems have the stored bytes."""
+    make_shipped_tapes.write_shapes(tmp_path)
+    stored, made = (
+        {path.name: path.read_bytes() for path in folder.iterdir()}
+        for folder in (shape.SHIPPED, tmp_path)
+    )
+    assert len(made) > 5
+    assert stored == made, MAKE
+
+
+def test_the_first_use_of_a_shipped_robot_computes_no_capsules(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Nothing is computed, also with an empty cache, and the capsules are those that the cache would keep."""
+    monkeypatch.setenv("CNPGEN_CACHE", str(tmp_path))
+    with monkeypatch.context() as patch:
+        patch.setattr(shape, "covering_capsule", lambda _: pytest.fail("it is stored"))
+        held = load_robot(load_problem("heavy-object")).held_shape
+    assert held is not None
+    assert len(held.capsules) > 3
+    assert not list(tmp_path.glob("shape-*"))
 
 
 @pytest.fixture

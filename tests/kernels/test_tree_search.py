@@ -85,6 +85,33 @@ def test_paths_are_reproducible(setting):
     assert not np.array_equal(paths[0], paths[2])
 
 
+def test_one_tree_reaches_one_of_several_goals(setting):
+    """In a wall, or behind it: paths end exactly in a goal, and Coal finds their states clear."""
+    problem, robot, _ = setting
+    start, goal = BESIDE_WALL
+    goals = np.array([[0.0, -0.1, 0.4, 0.0], goal + 0.2, goal])
+    hulls, poses = CoalHulls(problem, robot), place_obstacles(problem.obstacle)
+    reached = set[int]()
+    for seed in range(6):
+        path = search(setting, ends=(start, goals), seed=seed, margin=0.003)
+        np.testing.assert_array_equal(path[0], start)
+        ends = np.flatnonzero((goals == path[-1]).all(axis=1))
+        assert len(ends) == 1
+        reached.add(int(ends[0]))
+        assert (
+            hulls.measure(along(path), poses).min() > -0.004
+        )  # between checked states
+    assert reached
+    assert reached <= {1, 2}
+    # One goal in an array of its own gives the same path.
+    single = search(setting, ends=(start, goal[None]))
+    np.testing.assert_array_equal(single, search(setting, ends=(start, goal)))
+    # The fastest clear line needs no tree.
+    near = start + np.array([[-0.3, 0, 0, 0], [-0.2, 0.1, 0, 0.1]])
+    lines = search(setting, ends=(start, np.concatenate([goals, near])))
+    np.testing.assert_array_equal(lines, [start, near[1]])
+
+
 def test_the_search_ends_with_enough_nodes(setting):
     assert search(setting, max_nodes=3) is None
     assert search(setting, max_nodes=10**9) is not None

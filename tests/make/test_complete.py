@@ -1,6 +1,7 @@
 """Completing tasks from Python and from tables: problems to solve, which task each is, what is wrong with a table."""
 
 import os
+from pathlib import Path
 from unittest.mock import Mock
 
 import h5py
@@ -11,6 +12,12 @@ import cnpgen
 from cnpgen.errors import DatasetError, UsageError
 from cnpgen.kernels.library import choose_backend
 from cnpgen.make.complete import complete
+from cnpgen.plans.evaluate import evaluate_plans
+from cnpgen.plans.plans import make_plans
+from cnpgen.problems.problem_record import as_record, open_problem
+from cnpgen.schema.catalogue import list_recipes
+from cnpgen.trajectory.boundary import Boundary
+from tests.examples.example_robots import needs_robots
 
 GOALS = [[1.0, 0.1], [3.0, 0.0], [1.1, -0.2]]  # m; the second is out of reach
 ANGLES = [0.0, 0.1, 0.2]  # rad
@@ -18,6 +25,14 @@ BOTH = (
     "".join(f"start_q.joint_{joint}," for joint in range(1, 7))
     + "goal_xyz.x,goal_xyz.y,"
 )
+# Their base is no start: the tool is above the plane, the object upside down.
+NEED_A_START = {"ur5-wipe", "heavy-object", "heavy-object-drive", "heavy-object-loads"}
+PROBLEMS = [
+    pytest.param(name, marks=needs_robots)
+    if name.startswith(("panda", "ur5"))
+    else name
+    for name in list_recipes("problem")
+]
 
 
 @pytest.fixture(scope="module")
@@ -226,3 +241,25 @@ def test_hdf5_with_columns_of_different_lengths_or_no_numbers_is_refused(tmp_pat
     ):
         with pytest.raises(DatasetError, match=message):
             complete("airhockey-replan", tmp_path / f"{name}.h5")
+
+
+@pytest.mark.parametrize("name", PROBLEMS)
+def test_the_default_start_of_every_shipped_problem_is_valid_or_documented(name):
+    problem, robot = open_problem(as_record(name))
+    base = robot.home[None]
+    still, spline = np.zeros_like(base), problem.trajectory
+    parameters = robot.nominal_parameters[None] if robot.parameters.names else None
+    boundary = Boundary(base, still, still, base, still, parameters=parameters)
+    path = np.repeat(base[:, None], spline.path_control_points, axis=1)
+    rate = np.ones((1, spline.rate_control_points))
+    plans = make_plans(
+        name, boundary, path_control_points=path, rate_control_points=rate
+    )
+    assert evaluate_plans(plans, workers=1).valid[0] == (name not in NEED_A_START)
+    guide = Path(__file__).parents[2] / "docs" / "how-to" / "tasks.md"
+    sentence = "`ur5-wipe` and `heavy-object*` need a start"
+    assert sentence in guide.read_text(encoding="utf-8")
+
+
+def test_the_default_start_on_a_table_answers_a_goal_alone():
+    assert complete("airhockey-tables", goal_xyz=GOALS[0]).reasons == ("",)

@@ -3,6 +3,7 @@
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -11,10 +12,8 @@ import cnpgen
 from cnpgen.cli.main import main
 from cnpgen.errors import DatasetError, UsageError
 from cnpgen.plans.join import concatenate
-from cnpgen.plans.plans import Plans
 from cnpgen.problems.problem import Problem
-from cnpgen.refine.goal_options import min_durations, refine_goal_options
-from cnpgen.refine.refinement import Refinement
+from cnpgen.refine.goal_options import goal_groups, min_durations, refine_to_any
 from cnpgen.refine.task import Attempt, Outcome
 from tests.examples.shaped_robot import SELF, write_problem
 
@@ -166,63 +165,56 @@ def test_the_command_takes_tables_of_poses(
         cnpgen.complete(crane, table)
 
 
-def refined(cost: dict[int, float]) -> Callable[..., Refinement]:
-    """Return a stand-in for ``refine_plans``: row -> cost, invalid if there is none."""
+def attempts(cost: dict[int, float], tried: list[int]) -> Callable[[Any], Attempt]:
+    """Return a stand-in for the refiner: number of a goal state -> cost, invalid if there is none."""
 
-    def refine(plans: Plans, **_: object) -> Refinement:
-        results = []
-        for plan, row in zip(
-            plans, plans.columns["row"].astype(int).tolist(), strict=True
-        ):
-            path, rate = plan.path_control_points[0], plan.rate_control_points[0]
-            reason = "ok" if row in cost else "robot in collision"
-            value = cost.get(row, np.inf)
-            results.append(
-                Attempt(
-                    path=path,
-                    rate=rate,
-                    cost=value,
-                    outcome=Outcome.SOLVED,
-                    reason=reason,
-                )
-            )
-        return Refinement(plans, plans, tuple(results))
+    def refine(number: int) -> Attempt:
+        tried.append(number)
+        return Attempt(
+            path=np.zeros((2, 2)),
+            rate=np.ones(2),
+            cost=cost.get(number, np.inf),
+            outcome=Outcome.SOLVED,
+            reason="ok" if number in cost else "robot in collision",
+        )
 
     return refine
 
 
-def test_the_best_valid_motion_to_any_goal_state_is_chosen(problem: Problem) -> None:
+@pytest.mark.parametrize(
+    ("cost", "first_valid", "chosen", "tried"),
+    [
+        ({0: 9.0, 1: 8.0, 2: 8.5}, False, 1, [2, 0, 1]),
+        ({1: 7.0}, False, 1, [2, 0, 1]),
+        ({}, False, 2, [2, 0, 1]),  # the first attempt without a valid one
+        ({0: 1.9, 1: 1.0}, False, 0, [2, 0]),  # no motion to goal state 1 is faster
+        ({2: 9.0, 0: 8.0}, True, 2, [2]),
+        ({0: 9.0, 1: 8.0}, True, 0, [2, 0]),
+    ],
+)
+def test_the_best_valid_motion_to_any_goal_state_is_chosen(
+    cost: dict[int, float], *, first_valid: bool, chosen: int, tried: list[int]
+) -> None:
+    calls = list[int]()
+    found, best = refine_to_any(
+        range(3),  # type: ignore[arg-type]
+        attempts(cost, calls),
+        order=[2, 0, 1],
+        min_durations=np.array([1.0, 2.0, 1.5]),
+        first_valid=first_valid,
+    )
+    assert (found, calls) == (chosen, tried)
+    assert best.valid == bool(cost)
+
+
+def test_goal_states_of_a_task_are_tried_in_their_order(problem: Problem) -> None:
     plans = cnpgen.complete(problem, goal_xyz=[GOALS[0], [0.4, -0.4, 0.5]]).plans
-    plans = replace(
-        plans, columns={**plans.columns, "row": np.arange(len(plans), dtype=float)}
-    )
-    counts, bounds = np.bincount(plans.sample_id), min_durations(plans)
+    counts = np.bincount(plans.sample_id)
     assert (counts >= 3).all()
-    first, second = 0, int(counts[0])
-    reported = list[tuple[int, int]]()
-    chosen = refine_goal_options(
-        plans,
-        refined({first: 9.0, first + 1: 8.0, first + 2: 8.5, second + 1: 7.0}),
-        journal=None,
-        begin=None,
-        progress=lambda *numbers: reported.append(numbers),
-    )
-    assert chosen.plans.columns["row"].tolist() == [first + 1, second + 1]
-    assert chosen.valid.all()
-    assert np.sum(reported, axis=0).tolist() == [2, 2]
-    fast = dict.fromkeys(
-        range(len(plans)), bounds[first + 1] * 0.999
-    )  # later goal states cannot be nearer
-    tried = list[int]()
-
-    def refine(rows: Plans, **options: object) -> Refinement:
-        tried.extend(rows.columns["row"].astype(int).tolist())
-        return refined(fast)(rows, **options)
-
-    refine_goal_options(
-        plans[plans.sample_id == 0], refine, journal=None, begin=None, progress=None
-    )
-    assert tried == [first]
+    rows = np.arange(len(plans))
+    assert goal_groups(plans) == [rows[: counts[0]].tolist(), rows[counts[0] :].tolist()]  # fmt: skip
+    mixed = plans[rows[::-1]]
+    assert goal_groups(mixed) == [rows[counts[1] - 1 :: -1].tolist(), rows[: counts[1] - 1 : -1].tolist()]  # fmt: skip
 
 
 @pytest.mark.slow

@@ -231,7 +231,8 @@ def test_a_planner_is_pickled_without_its_kernels(planner, rows):
 def test_reprs_of_planners_models_and_plans(planner, rows):
     size = f"{planner.model.architecture.layers} x {planner.model.architecture.hidden}"
     assert repr(planner) == f"<Planner for 'airhockey': a network of {size}>"
-    assert repr(planner.model) == f"<Model of 'airhockey': a network of {size}>"
+    free = "goal_acceleration = 'free'"
+    assert repr(planner.model) == f"<Model of 'airhockey': a network of {size}, {free}>"
     plans = planned(planner, rows)
     assert repr(plans) == "<40 plans of 'airhockey': 40 unknown>"
     status = np.array([1, 1, 2], np.uint8)

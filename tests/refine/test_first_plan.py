@@ -15,9 +15,11 @@ from cnpgen.refine import first_plan
 from cnpgen.refine.first_plan import fast_rate
 from cnpgen.refine.options import RefineOptions
 from cnpgen.refine.strategy import PlanChecker
+from cnpgen.robots.obstacle import Obstacle
 from cnpgen.scenes import SceneProblem, solve_scenes
 from cnpgen.trajectory.spline import clamped_knots
 from cnpgen.trajectory.trajectory_spec import TrajectorySpec
+from tests.examples.narrow import BESIDE_WALL
 from tests.examples.shaped_robot import SELF, write_problem
 from tests.make.test_solve_scenes import LIMITS, SCENES
 
@@ -71,6 +73,26 @@ def test_first_plans_are_valid_and_equal_in_every_run(crane: Path) -> None:
     ratio = solved[0].plans.duration / usual.plans.duration
     assert (ratio > 1).all()
     assert (ratio < 5).all()
+
+
+def test_one_tree_decides_which_of_many_goals_is_reached_first(crane: Path) -> None:
+    """A wall is between the start and the eleven nearest of twelve goal states; the plan is that of its goal alone."""
+    wall = Obstacle(name="wall", position=(0.55, 0.0, 0.4), size=(0.9, 0.06, 0.8))
+    start, behind = BESIDE_WALL
+    shifts = np.linspace([0.0, 0.0, 0.0, -0.4], [0.0, 0.1, -0.1, 0.4], 11)
+    goals = np.array([*(behind + shifts), start - np.array([1.65, 0.0, 0.0, 0.0])])
+    scene = SceneProblem(name="wall", obstacles=(wall,), start_q=start, goal_q=goals)
+    solved = solve_scenes(crane, [scene], options=FIRST, workers=1)
+    assert solved.valid.all()
+    np.testing.assert_array_equal(solved.plans.boundary.goal_q, goals[-1:])
+    assert cnpgen.evaluate_plans(solved.plans, workers=1).verdicts[0].valid
+    for wanted in (goals[-1:], goals[5:6]):
+        alone = solve_scenes(crane, [replace(scene, goal_q=wanted)], options=FIRST, workers=1)  # fmt: skip
+        equal = np.array_equal(
+            alone.plans.path_control_points, solved.plans.path_control_points
+        )
+        assert equal == np.array_equal(wanted, goals[-1:])
+        assert alone.valid.all()
 
 
 def test_a_long_limit_returns_the_plan_of_the_whole_search(crane: Path) -> None:

@@ -1,10 +1,14 @@
 """The list of written files: own files are replaced and removed, others are refused by name."""
 
+import os
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
 
 from cnpgen.errors import UsageError
+from cnpgen.store.files.leftovers import temporary_name
 from cnpgen.store.files.written_files import LIST, claim_files, record_files
 
 
@@ -71,3 +75,18 @@ def test_a_list_never_leads_out_of_the_folder(tmp_path: Path) -> None:
     (folder / LIST).write_text(listing)
     write(folder, ["1.csv"])
     assert outside.read_text() == "kept"
+
+
+def test_temporary_files_of_a_killed_call_are_removed(tmp_path: Path) -> None:
+    with subprocess.Popen([sys.executable, "-c", ""]) as gone:
+        gone.wait()
+    names = ["a/1.csv", "card.md"]
+    claim_files(tmp_path, names)  # then the process was killed
+    (tmp_path / "a").mkdir()
+    for name in names:
+        half = temporary_name(Path(name).name).replace(
+            f"-{os.getpid()}.", f"-{gone.pid}."
+        )
+        (tmp_path / name).with_name(half).write_text("half")
+    write(tmp_path, names)
+    assert present(tmp_path) == set(names)

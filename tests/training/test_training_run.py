@@ -395,7 +395,9 @@ def test_only_temporary_files_of_killed_runs_are_removed(train, tmp_path):
     def of(name: str, process: int) -> str:
         return temporary_name(name).replace(f"-{os.getpid()}.", f"-{process}.")
 
-    mine = [of(f"model.{end}", gone.pid) for end in ("h5", "checkpoint", "jsonl")]
+    mine = [
+        of(f"model.{end}", gone.pid) for end in ("h5", "checkpoint", "jsonl", "png")
+    ]
     others = [of("model.h5", os.getppid()), of("other.h5", gone.pid), ".model.h5.tmp"]
     for name in (*mine, *others):
         (tmp_path / name).write_bytes(b"half")

@@ -188,30 +188,27 @@ def test_the_search_agrees_with_brute_force_on_random_motions(seed):
 
 
 def test_a_path_that_is_not_exact_measures_only_if_bounds_are_not_sufficient():
-    """Its distances are bounds if these are sufficient, and those of an exact path otherwise."""
+    """Its distances are bounds once these are sufficient; a smaller one is exact, as that of an exact path."""
     problem = PROBLEMS["heavy-object"]
     world, poses = (
         PathWorld(ROBOTS["heavy-object"], problem.obstacle, problem.object_size),
         np.full(2, -0.3),
     )
     states = wandering(world.robot, seed=12, count=400)
-    distances_of = {}
-    for exact in (True, False):
-        world.set_path(*states, poses, exact=exact)
-        for what in ("segment", "object"):
-            distances = getattr(world, f"{what}_distances")
-            least = np.min(world.pairs("robot" if what == "segment" else what).bounds)
-            distances_of[what, exact] = [
-                np.array(distances(sufficient))
-                for sufficient in (least - 1e-3, least + 1e-3)
-            ]
     for what in ("segment", "object"):
-        (known, _), (bounds, measured) = (
-            distances_of[what, True],
-            distances_of[what, False],
+        world.set_path(*states, poses, exact=True)
+        known = np.array(getattr(world, f"{what}_distances")(0.0))
+        world.set_path(*states, poses, exact=False)
+        distances = getattr(world, f"{what}_distances")
+        least = np.min(world.pairs("robot" if what == "segment" else what).bounds)
+        bounds, raised, measured = (
+            np.array(distances(sufficient))
+            for sufficient in (least - 1e-3, least + 1e-3, known.min() + 1e-3)
         )
-        assert (bounds <= known + 1e-9).all()
+        for found in (bounds, raised):
+            assert (found <= known + 1e-9).all()
         assert bounds.min() < known.min() - 1e-3
+        assert raised.min() >= least + 1e-3
         np.testing.assert_array_equal(measured, known)
 
 

@@ -63,6 +63,15 @@ def add_options(parser: Parser) -> None:
         type=values.positive,
         help="number of problems; a random suite has any number",
     )
+    _add_execution(parser)
+    _add_planning(parser)
+    _add_comparison(parser)
+    add_json(parser)
+
+
+def _add_execution(parser: Parser) -> None:
+    """Add the options of the simulated execution."""
+    option = parser.add_argument
     option("--simulate", action="store_true", help="also execute the plans")
     option(
         "--plant",
@@ -77,6 +86,11 @@ def add_options(parser: Parser) -> None:
         action="store_true",
         help="film the first plan of every planner for the report",
     )
+
+
+def _add_planning(parser: Parser) -> None:
+    """Add the options of the runs of planners."""
+    option = parser.add_argument
     option(
         "--time-limit",
         metavar="S",
@@ -102,6 +116,11 @@ def add_options(parser: Parser) -> None:
         default=1,
         help="repetitions of every problem (default: 1)",
     )
+
+
+def _add_comparison(parser: Parser) -> None:
+    """Add the options of the comparison, of the planners' fields and of earlier results."""
+    option = parser.add_argument
     text = "largest distance of the mallet of a successful hit from the table plane (default: 20mm)"
     option(
         "--plane-tolerance", metavar="M", type=values.meters, default=0.02, help=text
@@ -127,7 +146,6 @@ def add_options(parser: Parser) -> None:
     )
     text = "delete results of another suite, version, time limit, seed or planner parameters in DIR"
     option("--force", action="store_true", help=text)
-    add_json(parser)
 
 
 def parameter(text: str) -> tuple[str, str, Any]:

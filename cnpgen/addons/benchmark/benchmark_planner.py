@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from cnpgen.addons.trajectories.sampled_trajectory import Trajectory
+from cnpgen.arrays import Array
 from cnpgen.errors import UsageError
 from cnpgen.plans.plans import Plans
 from cnpgen.problems.problem import Problem
@@ -96,6 +97,12 @@ def require_rigid_torque(planner: str, problem: Problem, robot: Robot) -> None:
             f"{planner} limits the torque of the rigid body only, {problem.name!r} has rotors, friction or motor limits"
             " in [drive]"
         )
+
+
+def distinct_times(t: Array, min_distance: float) -> Array:
+    """Return ascending times without those that are too close to the next one [s]; the last one stays."""
+    times = np.unique(t)
+    return np.append(times[:-1][np.diff(times) > min_distance], times[-1])
 
 
 def load_kind(name: str) -> type[BenchmarkPlanner]:

@@ -91,11 +91,15 @@ def values_of(
         if "penalty_points" in executed:
             values["violated"] = executed["penalty_points"] > 0
         values["success"] = bool(executed) and succeeded(executed, plane_tolerance)
-    verdict = row.get("verdict")
+    return {**values, **_values_of_verdict(row.get("verdict"))}
+
+
+def _values_of_verdict(verdict: Mapping[str, Any] | None) -> Values:
+    """Return the flags and figures of a plan; without a plan, it is not valid."""
     if verdict is None:
-        return {**values, "valid": False, "paper_valid": False, "paper_finished": False}
+        return {"valid": False, "paper_valid": False, "paper_finished": False}
     metrics, paper = verdict["metrics"], verdict["paper"]
-    values |= {
+    values: Values = {
         "valid": verdict["valid"],
         "paper_valid": paper["valid"],
         "paper_finished": paper["finished"],

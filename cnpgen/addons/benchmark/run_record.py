@@ -101,10 +101,12 @@ def load_runs(folder: Path) -> tuple[RunRecord, ...]:
     )
 
 
-def save_runs(folder: Path, runs: Sequence[RunRecord]) -> None:
-    """Write the records of all runs."""
+def add_run(folder: Path, seed: int, planners: Sequence[str]) -> tuple[RunRecord, ...]:
+    """Record a run that begins now, and return the records of all runs; errors as of ``load_runs``."""
+    runs = (*load_runs(folder), describe_run(seed, planners))
     documents: list[dict[str, Any]] = [asdict(run) for run in runs]
     write_file(folder / RUNS_FILE, json.dumps(documents, indent=1) + "\n")
+    return runs
 
 
 def _processor() -> str:

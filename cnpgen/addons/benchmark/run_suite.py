@@ -7,7 +7,7 @@ from collections.abc import Callable, Generator, Mapping, Sequence
 from contextlib import closing
 from dataclasses import asdict, dataclass, replace
 from functools import partial
-from itertools import product
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -24,12 +24,7 @@ from cnpgen.addons.benchmark.results_file import (
     ResultsFolder,
     answer_from_dict,
 )
-from cnpgen.addons.benchmark.run_record import (
-    RunRecord,
-    describe_run,
-    load_runs,
-    save_runs,
-)
+from cnpgen.addons.benchmark.run_record import RunRecord, add_run
 from cnpgen.addons.benchmark.simulator.challenge import challenge_plant, check_challenge
 from cnpgen.addons.benchmark.simulator.execute import load_mujoco
 from cnpgen.addons.benchmark.simulator.executed import PLANE_TOLERANCE_M
@@ -174,8 +169,8 @@ def run_benchmark(
     where = Engine(chosen.engine, chosen.address, workers)
     with concerning("suite"):
         loaded = suite if isinstance(suite, Suite) else load_suite(suite)
-    given = _checked_planners(planners, loaded.planners or {}, parameters or {})
     # Planners, plants and their parameters are checked before any planning.
+    given = _checked_planners(planners, loaded.planners or {}, parameters or {})
     values = {name: _checked_parameters(name, given[name]) for name in planners}
     robots = _checked_plants(plants, chosen.environment)
     problems, prefix = loaded.problems(n)
@@ -184,46 +179,16 @@ def run_benchmark(
     limit, seed = float(chosen.time_limit), int(chosen.seed)
     setting = Setting(problems.problem, loaded.model, limit, seed)
     place = ResultsFolder(Path(folder), loaded, setting)
-    _check_reference(
-        chosen.reference, {*place.planners(delete_others=force), *planners}
-    )
-    runs = (*load_runs(place.path), describe_run(seed, planners))
-    save_runs(place.path, runs)
+    names = {*place.planners(delete_others=force), *planners}
+    _check_reference(chosen.reference, names)
+    runs = add_run(place.path, seed, planners)
     with assembled(where, len(problems)) as pool:
-        plan = _plan_locally if chosen.engine is None else partial(_plan_in_pool, pool)
-        for name, repetition in product(planners, range(chosen.repeat)):
-            results = place.open(
-                name,
-                repetition,
-                values[name],
-                overwrite=force,
-                discard=chosen.replan,
-            )
-            task = replace(setting, repetition=repetition, parameters=given[name])
-            label = name if chosen.repeat == 1 else f"{name}, repetition {repetition}"
-            report = partial(progress or (lambda *_: None), f"{label} plans")
-            _plan_all(results, problems, partial(plan, name, task), report)
-            for plant in robots:
-                activity = f"{label}, {plant.name} plant"
-                report = partial(progress or (lambda *_: None), activity)
-                _execute_all(results, plant, problems, prefix, pool=pool, report=report)
-    rows = place.rows(planners)
-    # The folder may have results of more problems than this run.
-    count = max(
-        (row["problem"] + 1 for part in rows.values() for row in part), default=0
-    )
-    if count > len(problems):
-        problems, prefix = loaded.problems(count)
-    return Benchmark(
-        loaded,
-        problems,
-        prefix,
-        rows,
-        robots,
-        runs,
-        chosen.reference,
-        chosen.plane_tolerance,
-    )
+        run = _BenchmarkRun(
+            place, robots, problems, prefix, pool, chosen, force, progress
+        )
+        for name in planners:
+            run.compare(name, replace(setting, parameters=given[name]), values[name])
+    return run.collected(loaded, planners, runs)
 
 
 def _check_reference(reference: str | None, names: set[str]) -> None:
@@ -290,20 +255,96 @@ def _checked_parameters(planner: str, parameters: Mapping[str, Any]) -> dict[str
     return dict(plain(asdict(loaded)))
 
 
-def _plan_all(
-    results: Results,
-    problems: Plans,
-    planned: Callable[[list[Numbered]], Rows],
-    report: Callable[[int, int], None],
-) -> None:
-    """Plan for the problems without result."""
-    waiting = [(index, problems[index]) for index in results.missing(len(problems))]
-    if not waiting:
-        return
-    with closing(planned(waiting)) as rows:
-        for done, row in enumerate(rows, start=len(problems) - len(waiting) + 1):
-            results.append(row)
-            report(len(problems), done)
+@dataclass(frozen=True, eq=False)
+class _BenchmarkRun:
+    """A run: where its results are, its plants and problems; planners run in the pool only with an engine."""
+
+    place: ResultsFolder
+    plants: tuple[Plant, ...]
+    problems: Plans
+    prefix: ExecutedPrefix | None
+    pool: WorkerPool
+    options: BenchmarkOptions
+    overwrite: bool
+    progress: Progress | None
+
+    def compare(self, name: str, setting: Setting, values: dict[str, Any]) -> None:
+        """Plan for all problems and execute the plans, once per repetition; ``values`` are those of all fields."""
+        for repetition in range(self.options.repeat):
+            results = self.place.open(
+                name,
+                repetition,
+                values,
+                overwrite=self.overwrite,
+                discard=self.options.replan,
+            )
+            self.plan(results, name, replace(setting, repetition=repetition))
+            for plant in self.plants:
+                self.execute(results, name, repetition, plant)
+
+    def collected(
+        self, suite: Suite, planners: Sequence[str], runs: tuple[RunRecord, ...]
+    ) -> Benchmark:
+        """Return the results of this run and of earlier ones, those of the given planners first."""
+        rows, options = self.place.rows(planners), self.options
+        problems, prefix = self.problems, self.prefix
+        # The folder may have results of more problems than this run.
+        count = max((row["problem"] + 1 for row in chain(*rows.values())), default=0)
+        if count > len(problems):
+            problems, prefix = suite.problems(count)
+        settled = options.reference, options.plane_tolerance
+        return Benchmark(suite, problems, prefix, rows, self.plants, runs, *settled)
+
+    def _report(self, activity: str, total: int, done: int) -> None:
+        if self.progress is not None:
+            self.progress(activity, total, done)
+
+    def _label(self, name: str, repetition: int) -> str:
+        return name if self.options.repeat == 1 else f"{name}, repetition {repetition}"
+
+    def plan(self, results: Results, name: str, setting: Setting) -> None:
+        """Plan for the problems without result."""
+        total, indices = len(self.problems), results.missing(len(self.problems))
+        waiting = [(index, self.problems[index]) for index in indices]
+        if not waiting:
+            return
+        rows = (
+            _plan_locally(name, setting, waiting)
+            if self.options.engine is None
+            else _plan_in_pool(self.pool, name, setting, waiting)
+        )
+        label = self._label(name, setting.repetition)
+        with closing(rows):
+            for done, row in enumerate(rows, start=total - len(waiting) + 1):
+                results.append(row)
+                self._report(f"{label} plans", total, done)
+
+    def execute(
+        self, results: Results, name: str, repetition: int, plant: Plant
+    ) -> None:
+        """Execute the plans that this plant has not executed."""
+        waiting = list(results.unexecuted(plant.name, len(self.problems)))
+        if not waiting:
+            return
+        prefix, activity = (
+            self.prefix,
+            f"{self._label(name, repetition)}, {plant.name} plant",
+        )
+        tasks = (
+            (
+                self.problems[index],
+                results.rows[index]["answer"],
+                prefix and prefix[index],
+            )
+            for index in waiting
+        )
+        run = partial(execute_answer, plant=plant)
+        with closing(self.pool.distribute(run, tasks, ordered=True)) as executions:
+            pairs = zip(waiting, executions, strict=True)
+            for done, (index, executed) in enumerate(pairs, start=1):
+                row = {"problem": index, "executed": {plant.name: executed.to_dict()}}
+                results.append(row)
+                self._report(activity, len(waiting), done)
 
 
 def _plan_locally(name: str, setting: Setting, waiting: list[Numbered]) -> Rows:
@@ -371,32 +412,3 @@ def verdict_to_dict(verdict: Verdict) -> dict[str, Any]:
             name: value for name, value in severity.items() if np.isfinite(value)
         },
     }
-
-
-def _execute_all(
-    results: Results,
-    plant: Plant,
-    problems: Plans,
-    prefix: ExecutedPrefix | None,
-    *,
-    pool: WorkerPool,
-    report: Callable[[int, int], None],
-) -> None:
-    """Execute the plans that this plant has not executed."""
-    waiting = list(results.unexecuted(plant.name, len(problems)))
-    if not waiting:
-        return
-    tasks = (
-        (problems[index], results.rows[index]["answer"], prefix and prefix[index])
-        for index in waiting
-    )
-    with closing(
-        pool.distribute(partial(execute_answer, plant=plant), tasks, ordered=True)
-    ) as executions:
-        for done, (index, executed) in enumerate(
-            zip(waiting, executions, strict=True), start=1
-        ):
-            results.append(
-                {"problem": index, "executed": {plant.name: executed.to_dict()}}
-            )
-            report(len(waiting), done)

@@ -71,6 +71,12 @@ def add_options(parser: Parser) -> None:
         type=values.positive,
         help="processes; default one per available core",
     )
+    _add_outputs(parser)
+
+
+def _add_outputs(parser: Parser) -> None:
+    """Add the options of what is printed and drawn."""
+    option = parser.add_argument
     option("--list", action="store_true", help="also list the plans, one per line")
     option(
         "--plan",

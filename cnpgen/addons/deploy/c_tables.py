@@ -161,8 +161,14 @@ def _spline_tables(parts: PlannerParts) -> Iterable[str]:
     yield table("double", "cell_edge", edges)
     yield table("int", "cell_span", np.floor(midpoints * spans))
     # Nodes and weights of [-1, 1] are mapped to [0, 1].
-    yield table("double", "node", (nodes + 1) / 2)
-    yield table("double", "node_weight", weights / 2)
+    nodes, weights = (nodes + 1) / 2, weights / 2
+    yield table("double", "node", nodes)
+    yield table("double", "node_weight", weights)
+    # Those of all cells: offsets from the left knot of the span, and parts of the width.
+    width = np.diff(edges)[:, None]
+    left = edges[:-1, None] - np.floor(midpoints * spans)[:, None] / spans
+    yield table("double", "node_offset", left + width * nodes)
+    yield table("double", "node_width", width * weights)
 
 
 def _taylor(points: int, degree: int) -> Array:

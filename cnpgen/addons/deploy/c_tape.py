@@ -3,10 +3,12 @@
 import re
 from itertools import accumulate
 
+from cnpgen.addons.deploy.planner_parts import LANES
 from cnpgen.addons.deploy.statements import statements
 from cnpgen.kernels.tape import Tape
 
 _NAME = re.compile(r"\b[tsc][0-9]+\b")  # values of ``statements``
+_ANGLE = re.compile(r"vsincos\((.*?),&")
 
 
 def point_function(tape: Tape, name: str) -> str:
@@ -19,7 +21,7 @@ def point_function(tape: Tape, name: str) -> str:
             f"out[{first_out[result] + component}]={value};"
         ),
     )
-    return f"{_head(tape, name)}\n{_lines(body)}\n}}\n"
+    return f"{_head(tape, name)}\n{_with_angles_together(_lines(body))}\n}}\n"
 
 
 def grid_function(tape: Tape, name: str, phases: str) -> str:
@@ -57,6 +59,45 @@ def _lines(body: str) -> str:
         read.update(names)
         kept.append(_in_doubles(line))
     return "\n".join(reversed(kept))
+
+
+def _with_angles_together(body: str) -> str:
+    """Compute sines and cosines of all angles that need no other ones in one loop, which becomes vector instructions."""
+    lines = body.splitlines()
+    later: set[str] = set()  # values that need a sine or cosine
+    together: list[str] = []
+    for line in lines:
+        own, *read = _NAME.findall(line) or [""]
+        if "vsincos(" in line:
+            together += [] if later.intersection(_angle(line)) else [line]
+            later.update(_defined(line))
+        elif later.intersection(read):
+            later.add(own)
+    # Backward, all values that these angles need are known.
+    needed = {name for line in together for name in _angle(line)}
+    before: list[str] = []
+    for line in reversed(lines):
+        if needed.intersection(_defined(line)) and line not in together:
+            before.append(line)
+            needed.update(_NAME.findall(line))
+    count = len(together) + -len(together) % LANES
+    loop = [
+        f"double angle[{count}]={{0}},sine[{count}],cosine[{count}];",
+        *(f"angle[{i}]={_ANGLE.search(line)[1]};" for i, line in enumerate(together)),  # type: ignore[index]
+        f"for(int i=0;i<{count};i++) vsincos(angle[i],&sine[i],&cosine[i]);",
+    ]
+    values = {
+        line: "const double {}=sine[{i}],{}=cosine[{i}];".format(*_defined(line), i=i)
+        for i, line in enumerate(together)
+    }
+    first = set(before)
+    rest = [values.get(line, line) for line in lines if line not in first]
+    return "\n".join([*reversed(before), *(loop if together else []), *rest])
+
+
+def _angle(line: str) -> list[str]:
+    """Return the value in a line of a sine and a cosine, or none for a constant angle."""
+    return _NAME.findall(_ANGLE.search(line)[1])  # type: ignore[index]
 
 
 def _defined(line: str) -> list[str]:

@@ -158,16 +158,17 @@ def _violations(
     )
     relaxed_by = relaxation if held else 0.0
     # Valid motions may use the tolerance, which is 1 in these units.
-    units = np.maximum(constraint.allowed(condition), MIN_TOLERANCE)
+    # Products take a fifth of the time of quotients.
+    per_unit = 1 / np.maximum(constraint.allowed(condition), MIN_TOLERANCE)
     violations = []
-    for value, low, high, unit in zip(
-        condition.g, condition.lower, condition.upper, units.tolist(), strict=True
+    for value, low, high, factor in zip(
+        condition.g, condition.lower, condition.upper, per_unit.tolist(), strict=True
     ):
         violations += (
-            [(float(low) - value - relaxed_by) / unit] if np.isfinite(low) else []
+            [(float(low) - value - relaxed_by) * factor] if np.isfinite(low) else []
         )
         violations += (
-            [(value - float(high) - relaxed_by) / unit] if np.isfinite(high) else []
+            [(value - float(high) - relaxed_by) * factor] if np.isfinite(high) else []
         )
     return violations
 

@@ -12,6 +12,8 @@ from cnpgen.robots.obstacle import Obstacle
 from cnpgen.schema.keys import Range
 
 Point = tuple[float, float, float]
+Area = tuple[float, float, float, float]
+"""The lowest and highest x, and the lowest and highest y, in the furniture's frame [m]."""
 
 MAX_PLACEMENTS = 60  # attempts to place an object
 OBJECT_GAP_M = 0.02  # between the circles round the bases of two objects
@@ -105,10 +107,24 @@ And heights [m].
 """
 
 
+def _free_place(
+    random: np.random.Generator, area: Area, radius: float, circles: list[Point]
+) -> tuple[float, float] | None:
+    """Draw a position at which a circle is apart from the others (x, y, radius); None without one."""
+    for _ in range(MAX_PLACEMENTS):
+        x = area[0] + (area[1] - area[0]) * random.random()
+        y = area[2] + (area[3] - area[2]) * random.random()
+        if all(
+            math.hypot(x - u, y - v) > radius + r + OBJECT_GAP_M for u, v, r in circles
+        ):
+            return x, y
+    return None
+
+
 def place_objects(
     random: np.random.Generator,
     furniture: Furniture,
-    area: tuple[float, float, float, float],
+    area: Area,
     z: float,
     objects: Objects,
     *,
@@ -117,36 +133,25 @@ def place_objects(
 ) -> None:
     """Place boxes and cylinders on a rectangle without overlap, with grasps at each, from above or along x.
 
-    The area is the lowest and highest x and the lowest and highest y, at the height z,
-    in the furniture's frame [m].
+    The area is at the height z [m].
     """
-    circles: list[tuple[float, float, float]] = []
+    circles: list[Point] = []
     count, widths, heights = objects
     for index in range(whole(random, count)):
         a, b, height = (uniform(random, size) for size in (widths, widths, heights))
         is_box = bool(random.random() < 0.5)
         # The circle round the base, whatever the turn of a box.
         radius = math.hypot(a, b) / 2 if is_box else a / 2
-        for _ in range(MAX_PLACEMENTS):
-            x = area[0] + (area[1] - area[0]) * random.random()
-            y = area[2] + (area[3] - area[2]) * random.random()
-            if all(
-                math.hypot(x - u, y - v) > radius + r + OBJECT_GAP_M
-                for u, v, r in circles
-            ):
-                break
-        # An object without a free place is left out.
-        else:
+        place = _free_place(random, area, radius, circles)
+        if place is None:
+            # An object without a free place is left out.
             continue
+        x, y = place
         circles.append((x, y, radius))
         name, center = f"{prefix} {index + 1}", (x, y, z + height / 2)
         if is_box:
-            furniture.box(
-                name,
-                center,
-                (a, b, height),
-                turn=float(random.uniform(-math.pi, math.pi)),
-            )
+            turn = float(random.uniform(-math.pi, math.pi))
+            furniture.box(name, center, (a, b, height), turn)
         else:
             furniture.cylinder(name, center, a / 2, height)
         if from_above:

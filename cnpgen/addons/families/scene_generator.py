@@ -122,10 +122,10 @@ def make_scenes(
     """
     n, seed = integer("n", n, least=1, most=MAX_SCENES), integer("seed", seed, least=0)
     per_scene = integer("per_scene", per_scene, least=1)
+    if parameters and not isinstance(family, str):
+        raise UsageError("parameters are for families by name", concerns="parameters")
     if isinstance(family, str):
         name, family = family, load_family(family, parameters)
-    elif parameters:
-        raise UsageError("parameters are for families by name", concerns="parameters")
     else:
         name = type(family).__name__
     loaded = as_problem(problem)
@@ -135,11 +135,8 @@ def make_scenes(
     scenes, failed, index = list[SceneProblem](), 0, 0
     while len(scenes) < n:
         random = np.random.default_rng([seed, zlib.crc32(name.encode()), index])
-        found = list(
-            generator.problems(
-                random, f"{name} {index}", min(per_scene, n - len(scenes))
-            )
-        )
+        count = min(per_scene, n - len(scenes))
+        found = list(generator.problems(random, f"{name} {index}", count))
         scenes += found
         index, failed = index + 1, 0 if found else failed + 1
         if failed > MAX_FAILED_SCENES:

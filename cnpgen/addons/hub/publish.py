@@ -135,18 +135,17 @@ def write_repository(
     )
     write_file(target / CARD, card)
     files: dict[str, list[SplitFile]] = {}
-    for task, path in zip(tasks, tables, strict=True):
-        name = path.relative_to(target).as_posix()
-        files.setdefault(task.split, []).append(
-            SplitFile(name, path.stat().st_size, file_sha256(path))
-        )
-    write_file(
-        target / CROISSANT,
-        render(croissant_of_tables(summary, files, created=created, url=url)) + "\n",
-    )
+    for task, path, name in zip(tasks, tables, written, strict=False):
+        files.setdefault(task.split, []).append(_split_file(path, name))
+    croissant = croissant_of_tables(summary, files, created=created, url=url)
+    write_file(target / CROISSANT, f"{render(croissant)}\n")
     # The next call knows the files that this one wrote.
     record_files(target, written)
     return written
+
+
+def _split_file(path: Path, name: str) -> SplitFile:
+    return SplitFile(name, path.stat().st_size, file_sha256(path))
 
 
 def _write_table(source: Path, spec: DatasetSpec, task: ShardTask, path: Path) -> None:

@@ -22,7 +22,12 @@ from cnpgen.problems.urdf_dynamics import (
 )
 from cnpgen.robots.robot import recipe_errors_in
 from cnpgen.robots.urdf import number_in, read_urdf, urdf_tree
-from cnpgen.robots.urdf_parameters import LinkInertia, UrdfJoint, urdf_parameters
+from cnpgen.robots.urdf_parameters import (
+    LinkInertia,
+    UrdfJoint,
+    UrdfParameters,
+    urdf_parameters,
+)
 
 # Ranges to either side, where the URDF has none.
 DEFAULT_RANGE_RAD, DEFAULT_RANGE_M = math.pi, 0.5
@@ -95,6 +100,44 @@ def read_arm(urdf: Path, tip: str | None) -> Arm:
             the tip.
         UsageError: The frame does not exist, or several links have no child.
     """
+    tree, parameters = _tree_and_parameters(urdf)
+    inertias, joints = parameters.inertias, parameters.joints
+    # Without a choice, only an unambiguous end of the robot is the tip.
+    tip = tip if tip is not None else _default_tip(urdf, list(inertias), joints)
+    if text := missing_frame(tree, urdf, tip):
+        raise UsageError(f"--tip: {text}")
+    moving = [joint for joint in _path(tip, joints) if joint.kind != "fixed"]
+    if not moving:
+        text = (
+            f"no joint moves the frame {tip!r}; its frames: {listed(frames_of(tree))}"
+        )
+        raise RecipeError([f"{urdf}: {text}"])
+    # The first planned joint moves all links beyond it.
+    moved = tuple(link for link in inertias if moving[0] in _path(link, joints))
+    names = {joint.name for joint in moving}
+    movable = [joint.name for joint in joints.values() if joint.kind != "fixed"]
+    shaped, drawn = _links_with(tree, "collision"), _links_with(tree, "visual")
+    return Arm(
+        urdf=urdf,
+        tip=tip,
+        planned=tuple(map(_joint, moving)),
+        locked=tuple(name for name in movable if name not in names),
+        moved=moved,
+        frames=tuple(frames_of(tree)),
+        masses={link: body.mass if body else 0.0 for link, body in inertias.items()},
+        impossible=tuple(link for link in moved if _is_impossible(inertias[link])),
+        shaped=shaped,
+        meshes=tuple(mesh.get("filename", "") for mesh in tree.iterfind("link//mesh")),
+        visual=tuple(link for link in drawn if link not in shaped),
+        locked_positions=_locked_positions(tree, joints.values(), names),
+        doubts=_doubts(urdf, tree),
+        friction=tuple(friction_in(moving)),
+        joint_notes=tuple(joint_notes(tree, moving)),
+    )
+
+
+def _tree_and_parameters(urdf: Path) -> tuple[Element, UrdfParameters]:
+    """Read the elements of a URDF, and its inertias and joints; raise RecipeError if that is impossible."""
     try:
         tree = urdf_tree(read_urdf(urdf))
     except ValueError as error:
@@ -103,56 +146,11 @@ def read_arm(urdf: Path, tip: str | None) -> Arm:
         raise RecipeError([text])
     with recipe_errors_in(urdf):
         parameters = urdf_parameters(tree)
-    links, joints = list(parameters.inertias), parameters.joints
-    if not links:
+    if not parameters.inertias:
         raise RecipeError(
             [f"{urdf}: has no <link>, expected a URDF (an SRDF is given by --srdf)"]
         )
-    # Without a choice, only an unambiguous end of the robot is the tip.
-    tip = tip if tip is not None else _default_tip(urdf, links, joints)
-    if text := missing_frame(tree, urdf, tip):
-        raise UsageError(f"--tip: {text}")
-    moving = [joint for joint in _path(tip, joints) if joint.kind != "fixed"]
-    if not moving:
-        raise RecipeError(
-            [
-                f"{urdf}: no joint moves the frame {tip!r}; its frames: {listed(frames_of(tree))}"
-            ]
-        )
-    planned = tuple(map(_joint, moving))
-    # The first planned joint moves all links beyond it.
-    moved = tuple(link for link in links if moving[0] in _path(link, joints))
-    names = {joint.name for joint in planned}
-    shaped = _links_with(tree, "collision")
-    locked = [
-        joint.name
-        for joint in joints.values()
-        if joint.kind != "fixed" and joint.name not in names
-    ]
-    return Arm(
-        urdf=urdf,
-        tip=tip,
-        planned=planned,
-        locked=tuple(locked),
-        moved=moved,
-        frames=tuple(frames_of(tree)),
-        masses={
-            link: inertia.mass if inertia else 0.0
-            for link, inertia in parameters.inertias.items()
-        },
-        impossible=tuple(
-            link for link in moved if _is_impossible(parameters.inertias[link])
-        ),
-        shaped=shaped,
-        meshes=tuple(mesh.get("filename", "") for mesh in tree.iterfind("link//mesh")),
-        visual=tuple(
-            link for link in _links_with(tree, "visual") if link not in shaped
-        ),
-        locked_positions=_locked_positions(tree, joints.values(), names),
-        doubts=_doubts(urdf, tree),
-        friction=tuple(friction_in(moving)),
-        joint_notes=tuple(joint_notes(tree, moving)),
-    )
+    return tree, parameters
 
 
 def _links_with(tree: Element, tag: str) -> tuple[str, ...]:

@@ -54,26 +54,12 @@ def comfortable_base(
     tips, values, load = _measure_states(world, states)
     if not any(isinstance(each, JointTorque) for each in problem.constraint):
         load[:] = 0.0
-    centre, half = (
-        (robot.position_upper + robot.position_lower) / 2,
-        (robot.position_upper - robot.position_lower) / 2,
-    )
-    # 1 in the middle of all joints, 0 at a limit of one of them.
-    margin = 1 - np.abs((states - centre) / half).max(axis=1)
-    # Directions in which the tip of an arm of fewer joints never moves do not count.
-    moves = values.max(axis=0) > MIN_TIP_TRAVEL_M
-    score = values[:, moves].prod(axis=1) * margin
-    ahead = tips - robot.chain.joints[0].translation
-    front = (
-        (ahead[:, 0] > 0)
-        & (np.abs(ahead[:, 1]) <= 0.2 * ahead[:, 0])
-        & (tips[:, 2] >= 0)
-    )
-    free, order = _free_states(robot, states), np.argsort(-score, kind="stable")
+    order = np.argsort(-_scores(robot, states, values), kind="stable")
+    free, light = _free_states(robot, states), load <= MAX_LOAD
     # Groups of states from the best to the least demanding one.
     groups = [
-        front & (load <= MAX_LOAD),
-        load <= MAX_LOAD,
+        _are_in_front(robot, tips) & light,
+        light,
         load <= 1,
         np.ones(len(states), bool),
     ]
@@ -93,6 +79,22 @@ def comfortable_base(
         if group.any()
     )
     return tuple(states[order[best[order]][0]].tolist()), notes
+
+
+def _scores(robot: Robot, states: Array, values: Array) -> Array:
+    """Return manipulability times the distance from the limits, by singular values of shape (N, k); shape (N,)."""
+    lower, upper = robot.position_lower, robot.position_upper
+    # 1 in the middle of all joints, 0 at a limit of one of them.
+    offsets = (states - (upper + lower) / 2) / ((upper - lower) / 2)
+    # Directions in which the tip of an arm of fewer joints never moves do not count.
+    moves = values.max(axis=0) > MIN_TIP_TRAVEL_M
+    return np.asarray(values[:, moves].prod(axis=1) * (1 - np.abs(offsets).max(axis=1)))
+
+
+def _are_in_front(robot: Robot, tips: Array) -> NDArray[np.bool_]:
+    """Return a mask of the tips ahead of the first joint along x and above the ground, shape (N,)."""
+    x, y, _ = (tips - robot.chain.joints[0].translation).T
+    return np.asarray((x > 0) & (np.abs(y) <= 0.2 * x) & (tips[:, 2] >= 0))
 
 
 def _states(robot: Robot) -> Array:

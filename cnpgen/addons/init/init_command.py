@@ -16,10 +16,15 @@ import sys
 import warnings
 from collections.abc import Mapping
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from cnpgen.cli.parser import Parser, refuse_others
 from cnpgen.cli.recipe_names import check_absent
 from cnpgen.errors import UsageError
+
+if TYPE_CHECKING:
+    from cnpgen.addons.init.arm import Arm
+    from cnpgen.addons.init.joint_limits import StatedJointLimits
 
 
 def add_options(parser: Parser) -> None:
@@ -66,9 +71,7 @@ def add_options(parser: Parser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> None:
-    from cnpgen.addons.init.arm import read_arm
     from cnpgen.addons.init.initial_recipes import dataset_of, problem_of
-    from cnpgen.addons.init.joint_limits import read_joint_limits, with_joint_limits
     from cnpgen.addons.init.write import FILES, problem_text, sampling_texts
     from cnpgen.robots.shape.mesh_files import packages_of_environment
 
@@ -78,14 +81,7 @@ def run(arguments: argparse.Namespace) -> None:
         _write_planner(folder, force=arguments.force)
         return
     check_absent(folder, FILES, force=arguments.force)
-    arm = read_arm(arguments.urdf, arguments.tip)
-    if arguments.collision_from_visual:
-        arm = arm.with_visual_shapes()
-    limits = None
-    if arguments.joint_limits is not None:
-        names = (*(joint.name for joint in arm.planned), *arm.locked)
-        limits = read_joint_limits(arguments.joint_limits, names)
-        arm = with_joint_limits(arm, limits)
+    arm, limits = _arm_and_limits(arguments)
     packages = (
         *arguments.packages,
         *packages_of_environment(arm.meshes, arm.urdf, arguments.packages),
@@ -116,6 +112,23 @@ def run(arguments: argparse.Namespace) -> None:
         sep="\n  ",
         file=sys.stderr,
     )
+
+
+def _arm_and_limits(
+    arguments: argparse.Namespace,
+) -> "tuple[Arm, StatedJointLimits | None]":
+    """Read the arm with the limits that a file states in place of its own, and these limits."""
+    from cnpgen.addons.init.arm import read_arm
+    from cnpgen.addons.init.joint_limits import read_joint_limits, with_joint_limits
+
+    arm = read_arm(arguments.urdf, arguments.tip)
+    if arguments.collision_from_visual:
+        arm = arm.with_visual_shapes()
+    if arguments.joint_limits is None:
+        return arm, None
+    names = (*(joint.name for joint in arm.planned), *arm.locked)
+    limits = read_joint_limits(arguments.joint_limits, names)
+    return with_joint_limits(arm, limits), limits
 
 
 def _write_planner(folder: Path, *, force: bool) -> None:

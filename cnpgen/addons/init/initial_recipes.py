@@ -83,14 +83,12 @@ def problem_of(
     Elements and attributes of both files with the names of ``allow_unused`` are not
     read.
     """
+    placeholder = with_torques(arm, [1.0] * len(arm.planned))
     _check_allowed(allow_unused, arm.urdf, srdf)
     problem = _problem(
-        with_torques(arm, [1.0] * len(arm.planned)), name, folder, packages, srdf
+        placeholder, name, folder, packages, srdf, skipped_meshes=skipped_meshes
     )
-    spec = replace(
-        problem.robot, skipped_meshes=skipped_meshes, allow_unused=allow_unused
-    )
-    problem = replace(problem, robot=spec)
+    problem = replace(problem, robot=replace(problem.robot, allow_unused=allow_unused))
     # Such as those about simplified meshes.
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
@@ -107,22 +105,23 @@ def problem_of(
     )
     problem = replace(problem, limits=limits)
     problem = _with_jerk_limits(problem, robot, joint_limits)
-    if robot.chain.joints[-1].mass > 0:
-        # Torques of links without masses are meaningless.
-        limit = JointTorque(tolerance=5e-3, budget=6e-2)
-        problem = replace(
-            problem,
-            constraint=(*problem.constraint[:4], limit, *problem.constraint[4:]),
-        )
-    else:
-        notes.append(
-            "no mass that the last joint moves: its torques would be wrong, so 'joint-torque' is omitted"
-        )
+    problem, torque_notes = _with_torque(problem, robot)
     base, base_notes = comfortable_base(problem, load_robot(problem))
     problem = replace(problem, robot=replace(problem.robot, base=base))
-    return InitialProblem(
-        problem, arm, overlaps, (*arm_notes(arm), *notes, *overloaded, *base_notes)
-    )
+    every = *arm_notes(arm), *notes, *torque_notes, *overloaded, *base_notes
+    return InitialProblem(problem, arm, overlaps, every)
+
+
+def _with_torque(problem: Problem, robot: Robot) -> tuple[Problem, tuple[str, ...]]:
+    """Return a problem with the limit of torques, or a note of the reason why it is omitted."""
+    # Torques of links without masses are meaningless.
+    if not robot.chain.joints[-1].mass > 0:
+        text = "no mass that the last joint moves: its torques would be wrong, so 'joint-torque' is omitted"
+        return problem, (text,)
+    # After the limits of joint positions and their derivatives.
+    limit = JointTorque(tolerance=5e-3, budget=6e-2)
+    constraints = (*problem.constraint[:4], limit, *problem.constraint[4:])
+    return replace(problem, constraint=constraints), ()
 
 
 def _check_allowed(keys: tuple[str, ...], urdf: Path, srdf: Path | None) -> None:
@@ -152,7 +151,13 @@ def dataset_of(initial: InitialProblem, folder: Path) -> tuple[DatasetRecipe, fl
 
 
 def _problem(
-    arm: Arm, name: str, folder: Path, packages: tuple[Path, ...], srdf: Path | None
+    arm: Arm,
+    name: str,
+    folder: Path,
+    packages: tuple[Path, ...],
+    srdf: Path | None,
+    *,
+    skipped_meshes: tuple[str, ...],
 ) -> Problem:
     """Return the problem without torques, with the base configuration at the centre of all limits."""
     centre = tuple((joint.lower + joint.upper) / 2 for joint in arm.planned)
@@ -167,21 +172,11 @@ def _problem(
         locked_positions=tuple(arm.locked_positions.values()),
         visual_links=tuple(link for link in arm.visual if link in arm.shaped),
         srdf="" if srdf is None else str(srdf.absolute()),
+        skipped_meshes=skipped_meshes,
     )
     limits = LimitSpec(
         velocity_scale=0.8, torque_scale=TORQUE_SCALE, **_replaced_limits(arm)
     )
-    constraints: tuple[Constraint, ...] = (
-        JointPosition(tolerance=1e-3),
-        JointVelocity(tolerance=2e-3, budget=6e-3),
-        JointAcceleration(tolerance=5e-3, budget=6e-2),
-    )
-    if arm.has_shape:
-        clearances = (
-            RobotClearance(tolerance=1e-3, budget=1e-6),
-            SelfClearance(tolerance=1e-3, budget=1e-6),
-        )
-        constraints = (*constraints, *clearances)  # obstacles may follow
     path, title = folder / "problem.toml", f"Move {arm.urdf.stem} within its limits"
     return Problem(
         name=name,
@@ -190,9 +185,25 @@ def _problem(
         robot=robot,
         limits=limits,
         drive=DriveSpec(urdf_dynamics=arm.urdf_dynamics) if arm.friction else NO_DRIVE,
-        constraint=constraints,
+        constraint=_constraints(arm),
         path=path.absolute(),
     )
+
+
+def _constraints(arm: Arm) -> tuple[Constraint, ...]:
+    """Return the limits of positions and their derivatives, and clearances of an arm with link geometry."""
+    constraints: tuple[Constraint, ...] = (
+        JointPosition(tolerance=1e-3),
+        JointVelocity(tolerance=2e-3, budget=6e-3),
+        JointAcceleration(tolerance=5e-3, budget=6e-2),
+    )
+    if not arm.has_shape:
+        return constraints
+    clearances = (
+        RobotClearance(tolerance=1e-3, budget=1e-6),
+        SelfClearance(tolerance=1e-3, budget=1e-6),
+    )
+    return (*constraints, *clearances)  # obstacles may follow
 
 
 def _replaced_limits(

@@ -5,10 +5,10 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import takewhile
 
+from cnpgen.addons.init.hull_gap import GAP_STATES, HullGap, PairGap, measure_hull_gap
 from cnpgen.errors import listed
 from cnpgen.problems.load_robot import load_robot
 from cnpgen.problems.problem import Problem
-from cnpgen.robots.shape.hull_gap import GAP_STATES, HullGap, PairGap, measure_hull_gap
 from cnpgen.robots.shape.inline import mesh_links
 from cnpgen.robots.shape.link_pairs import LinkPair
 from cnpgen.robots.urdf import read_urdf

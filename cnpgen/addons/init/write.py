@@ -2,7 +2,7 @@
 
 import json
 import os
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from textwrap import wrap
@@ -112,6 +112,37 @@ def _about(initial: InitialProblem, robot: Robot) -> Iterator[str]:
     yield "#"
     yield from table(list(_joint_rows(arm)), indent="#   ", right=(2, 3, 4))
     yield "#"
+    yield from table(_facts(arm, robot), indent="#   ")
+    for note in initial.notes:
+        yield "#"
+        yield from wrap(
+            note,
+            RECIPE_LINE_WIDTH,
+            initial_indent="#   - ",
+            subsequent_indent="#     ",
+        )
+    if robot.shape is not None:
+        title = "Links: solvers use capsules around them, judges their convex parts"
+        yield from _titled(title, link_rows(robot.shape), range(1, 6))
+        title = "Pairs of links, by random states"
+        yield from _titled(title, pair_rows(robot.shape), (2, 3))
+    if initial.overlaps and (rows := _gap_rows(initial.overlaps)):
+        title = (
+            "Links that overlap by their convex hulls or parts, but not by their meshes"
+        )
+        yield from _titled(title, rows, (2, 3, 4, 5))
+
+
+def _titled(
+    title: str, rows: list[tuple[str, ...]], right: Sequence[int]
+) -> Iterator[str]:
+    """Yield a table below its title, with the columns that are aligned to the right."""
+    yield from ("#", f"#   {title}", "#")
+    yield from table(rows, indent="#   ", right=right)
+
+
+def _facts(arm: Arm, robot: Robot) -> list[tuple[str, str]]:
+    """Return what was found out about joints, masses, frames and link geometry."""
     heavy = [link for link in arm.moved if arm.masses.get(link)]
     light = [link for link in arm.moved if not arm.masses.get(link)]
     mass = sum(arm.masses[link] for link in heavy)
@@ -143,33 +174,7 @@ def _about(initial: InitialProblem, robot: Robot) -> Iterator[str]:
                 "no link that moves has a <collision> element, so that 'self-clearance' is left out",
             )
         ]
-    yield from table(facts, indent="#   ")
-    for note in initial.notes:
-        yield from (
-            "#",
-            *wrap(
-                note,
-                RECIPE_LINE_WIDTH,
-                initial_indent="#   - ",
-                subsequent_indent="#     ",
-            ),
-        )
-    if robot.shape is not None:
-        yield from (
-            "#",
-            "#   Links: solvers use capsules around them, judges their convex parts",
-            "#",
-        )
-        yield from table(link_rows(robot.shape), indent="#   ", right=range(1, 6))
-        yield from ("#", "#   Pairs of links, by random states", "#")
-        yield from table(pair_rows(robot.shape), indent="#   ", right=(2, 3))
-    if initial.overlaps and (rows := _gap_rows(initial.overlaps)):
-        yield from (
-            "#",
-            "#   Links that overlap by their convex hulls or parts, but not by their meshes",
-            "#",
-        )
-        yield from table(rows, indent="#   ", right=(2, 3, 4, 5))
+    return facts
 
 
 def _gap_rows(overlaps: LinkOverlaps) -> list[tuple[str, ...]]:

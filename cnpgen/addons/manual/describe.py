@@ -9,7 +9,9 @@ from cnpgen.cli.terminal import LINE_WIDTH, table
 from cnpgen.make.any_recipe import Recipe
 from cnpgen.make.recipe import DatasetRecipe, recipe_digest
 from cnpgen.pipelines.pipeline import Pipeline
+from cnpgen.pipelines.stages.boundary_motion import AtRest, TableAcceleration
 from cnpgen.pipelines.stages.stage import Stage
+from cnpgen.planner.model import Model
 from cnpgen.problems.constraints.constraint import Constraint
 from cnpgen.problems.constraints.joint import judged_torque
 from cnpgen.problems.load_robot import load_robot
@@ -79,6 +81,8 @@ def describe_pipeline(pipeline: Pipeline) -> str:
     steps.append(
         ("", "(always)", "reject samples whose stored values violate a constraint")
     )
+    if not any(_prescribes_goal_acceleration(stage) for stage in pipeline.stage):
+        steps.append(("", "(goal)", 'goal_acceleration = "free": no stage writes it'))
     return "\n".join(
         [
             f"pipeline {pipeline.name}",
@@ -86,6 +90,13 @@ def describe_pipeline(pipeline: Pipeline) -> str:
             *table(steps, indent="  "),
         ]
     )
+
+
+def _prescribes_goal_acceleration(stage: Stage) -> bool:
+    """Return whether a stage writes goal accelerations, with which motions must end."""
+    if isinstance(stage, AtRest):
+        return (stage.end, stage.acceleration) == ("goal", "zero")
+    return isinstance(stage, TableAcceleration) and stage.end == "goal"
 
 
 def describe_problem(problem: Problem) -> str:
@@ -375,6 +386,28 @@ def kind_name(item: Stage | Constraint) -> str:
     """Return the name under which the kind of a stage or constraint is registered."""
     group = registry.STAGES if isinstance(item, Stage) else registry.CONSTRAINTS
     return registry.name_of(group, type(item))
+
+
+def model_to_dict(model: Model) -> dict[str, Any]:
+    """Describe a model for JSON: its problem, its network, and whether motions may end with an acceleration."""
+    return {
+        "kind": "model",
+        "problem": model.problem.name,
+        "network": str(model.architecture),
+        "goal_acceleration": model.goal_acceleration,
+    }
+
+
+def describe_model(facts: dict[str, Any]) -> str:
+    """Describe a model in two lines."""
+    text = {
+        "free": "motions may end with a step of acceleration",
+        "given": "motions end with that of the problem, 0 by default",
+    }[facts["goal_acceleration"]]
+    return (
+        f"model of {facts['problem']}: a network of {facts['network']}\n"
+        f'  goal_acceleration = "{facts["goal_acceleration"]}": {text}'
+    )
 
 
 def recipe_to_dict(recipe: Recipe) -> dict[str, Any]:

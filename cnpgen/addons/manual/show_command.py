@@ -1,11 +1,13 @@
 """Describe a recipe, a kind of stage or constraint, or the keys of recipe files.
 
-A dataset is shown with its pipeline and its problem, a pipeline with its problem.
+A dataset is shown with its pipeline, its problem and the model of its name, a pipeline
+with its problem; a file of a model with what the model leaves free.
 Errors in a file are reported on stderr with file and key, one per line, and the exit
 code is 2.
 """
 
 import argparse
+from pathlib import Path
 
 from cnpgen.cli.parser import Parser, add_json
 from cnpgen.cli.recipe_names import check_recipe
@@ -15,9 +17,7 @@ from cnpgen.schema.toml import MARKS
 
 def add_options(parser: Parser) -> None:
     what = parser.add_mutually_exclusive_group(required=True)
-    text = (
-        "a shipped dataset, pipeline or problem (see 'cnpgen list'), or a recipe file"
-    )
+    text = "a shipped dataset, pipeline or problem (see 'cnpgen list'), or the file of a recipe or model"
     what.add_argument("recipe", metavar="NAME|FILE", nargs="?", help=text)
     what.add_argument(
         "--stage", metavar="KIND", help="describe a kind of stage and its keys"
@@ -47,20 +47,28 @@ def add_options(parser: Parser) -> None:
 def run(arguments: argparse.Namespace) -> None:
     from cnpgen.addons.manual import describe
     from cnpgen.make.any_recipe import load_any
+    from cnpgen.planner.model_file import load_model, shipped_models
     from cnpgen.store.files.documents import plain, render
+    from cnpgen.store.paths import file_kind
 
     if arguments.recipe is None:
         if arguments.kind:
             raise UsageError("--kind needs NAME or FILE")
         print(_about_kinds(arguments))
         return
+    if file_kind(Path(arguments.recipe)) == "a model of cnpgen":
+        found = describe.model_to_dict(load_model(arguments.recipe))
+        print(render(found) if arguments.json else describe.describe_model(found))
+        return
     check_recipe(arguments.recipe)
     recipe = load_any(arguments.recipe, arguments.kind)
-    print(
-        render(plain(describe.recipe_to_dict(recipe)))
-        if arguments.json
-        else describe.describe(recipe)
-    )
+    if arguments.json:
+        print(render(plain(describe.recipe_to_dict(recipe))))
+        return
+    print(describe.describe(recipe))
+    if arguments.kind is None and arguments.recipe in shipped_models():
+        found = describe.model_to_dict(load_model(arguments.recipe))
+        print(f"\n{describe.describe_model(found)}")
 
 
 def _about_kinds(arguments: argparse.Namespace) -> str:

@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import ArrayLike
 
+from cnpgen.addons.online.plan_runtime import positive
 from cnpgen.addons.trajectories.refuted_limits import refuted_limits
 from cnpgen.addons.trajectories.sample_errors import SampleErrors
 from cnpgen.addons.trajectories.sampled_trajectory import Trajectory
@@ -25,8 +26,8 @@ from cnpgen.world.path import PathWorld
 MIN_CHUNK_SAMPLES = 8  # of a chunk after the join: fewer have no reliable velocity
 MAX_DURATION = 1.2  # of a motion, in chunk lengths
 SAMPLE_ROUNDING = 1e-6  # samples
-NOISE_RAD = 1e-3
 TIMES_S = 1e-3, 60.0  # range of options
+NOISE_RAD = 1e-3
 MAX_RESTING_SPEED = 0.05  # fraction of the velocity limits, of an arm that is at rest
 
 
@@ -49,9 +50,7 @@ class ChunkOptions:
 
     def __post_init__(self) -> None:
         check_fields(self)
-        if number("noise", self.noise) <= 0:
-            text = f"must be positive, got {self.noise:g}"
-            raise UsageError(text, argument="noise")
+        positive("noise", self.noise)
         if self.stop_after is not None:
             bounded("stop_after", self.stop_after, *TIMES_S, "s")
 

@@ -35,7 +35,7 @@ from cnpgen.schema.argument_types import checked_arguments
 from cnpgen.schema.arguments import integer, number
 from cnpgen.store.dataset_spec import StoredProblem
 
-RATES_HZ = 0.1, 1000.0  # range of the option
+RATES_HZ = 0.1, 1000.0  # range of an option
 MAX_CHUNK_SAMPLES, MAX_SPEED = 1000, 10.0
 STOP_DELAY_S = 0.05  # of a stop after its cause: it is computed meanwhile
 MAX_POSITION = 1e6  # rad or m, of a chunk

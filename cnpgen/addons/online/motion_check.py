@@ -23,6 +23,7 @@ from cnpgen.problems.problem_record import ProblemRecord, open_problem
 from cnpgen.world.path import PathWorld
 
 MAX_CHECK_STEP_S = 1e-3
+STEP_ROUNDING = 1e-6  # relative, of the widths of cells
 JERK_STEP_S = 1e-6  # of the difference quotient of accelerations
 
 
@@ -43,8 +44,12 @@ class MotionChecker:
 
     def violation(self, motion: SampledMotion, first: float, last: float) -> str:
         """Describe the first violated constraint of a motion between two times [s]; empty if there is none."""
-        count = int(np.ceil((last - first) / MAX_CHECK_STEP_S)) + 1
-        times = np.linspace(first, last, max(count, 2))
+        # Accelerations have their kinks at edges of cells.
+        edges = motion.edges[(first < motion.edges) & (motion.edges < last)]
+        times = np.concatenate([[first], edges, [last]])
+        if np.diff(times).max() > MAX_CHECK_STEP_S * (1 + STEP_ROUNDING):
+            count = int(np.ceil((last - first) / MAX_CHECK_STEP_S)) + 1
+            times = np.union1d(times, np.linspace(first, last, count))
         for part, mask, phases in passed_parts(motion, times):
             if found := self._violation(part, motion, times[mask], phases):
                 return found

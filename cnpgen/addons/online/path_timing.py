@@ -85,9 +85,10 @@ class PathLimits:
         speed, brake, travel = (table[shapes] for table in shape_table())
         # Place on the path that each law has reached at its phases.
         sigma = start[:, None] + duration[:, None] * travel
-        position = (sigma - self.times[0]) / (self.times[1] - self.times[0])
-        node = np.clip(position.astype(int), 0, len(self.times) - 2)
-        share = np.clip(position - node, 0.0, 1.0)[..., None]
+        node = np.searchsorted(self.times, sigma, side="right") - 1
+        node = np.clip(node, 0, len(self.times) - 2)
+        width = self.times[node + 1] - self.times[node]
+        share = np.clip((sigma - self.times[node]) / width, 0.0, 1.0)[..., None]
         # The tables have w times the duration.
         u2, w = (speed**2)[..., None], (brake / duration[:, None])[..., None]
         # The value is linear in each of the tables, so the two nodes are compared.
@@ -146,6 +147,8 @@ def path_limits(
     assert motion.plan is not None
     # At least three nodes, also for a short remainder of the motion.
     times = np.linspace(first, last, max(3, int((last - first) / NODE_STEP_S) + 2))
+    kinks = _kinks(motion)
+    times = np.union1d(times, kinks[(first < kinks) & (kinks < last)])
     # At its end a sampled motion is at rest: the state before is that of its last cell.
     states = motion.at(np.minimum(times, np.nextafter(motion.end_time, -np.inf)))
     terms = []
@@ -160,6 +163,12 @@ def path_limits(
         MAX_BRAKING_USE * limit, np.abs(rest + square) * (1 + TIMING_ROUNDING)
     )
     return PathLimits(times, rest, square, brake_factor, limit)
+
+
+def _kinks(motion: SampledMotion) -> Array:
+    """Return the edges between cells of unequal widths [s]: only there may an acceleration have a kink."""
+    change = np.abs(np.diff(np.diff(motion.edges)))
+    return motion.edges[1:-1][change > TIMING_ROUNDING]
 
 
 def _terms(
@@ -206,13 +215,21 @@ def _acceleration_factor(part: Plans, robot: Robot) -> float:
     )
 
 
+def _law_grid(law: TimeLaw) -> Array:
+    """Return the edges of cells from 0 to the duration of a time law [s]; w has no kink within a cell."""
+    rise, fall = law.duration * law.rise, law.duration * law.fall
+    # A polynomial over a kink of the acceleration would exceed both of its ends.
+    ramp, level = grid(rise), rise + grid(law.duration - rise - fall)
+    return np.concatenate([ramp[:-1], level[:-1], law.duration - grid(fall)[::-1]])
+
+
 def retimed(motion: SampledMotion, law: TimeLaw) -> SampledMotion:
     """Return the motion that leaves another one at ``law.start`` and rests at ``law.end``.
 
     Before the law begins, it is the given motion.
     """
     assert motion.plan is not None
-    times = grid(law.duration)
+    times = _law_grid(law)
     u, brake, travel = shape_at(times / law.duration, law.rise, law.fall)
     sigma = law.start + law.duration * travel
     # A law may end where the path ends.

@@ -18,14 +18,14 @@ from cnpgen.addons.scene_files.moveit_frames import (
     frame_id,
     optional_pose,
 )
-from cnpgen.arrays import Array
-from cnpgen.errors import UsageError
-from cnpgen.problems.scenes.placement import moved_obstacle
-from cnpgen.problems.scenes.point_cloud import (
+from cnpgen.addons.scene_files.point_cloud import (
     MAX_POINTS,
     MIN_VOXEL_M,
     obstacles_of_points,
 )
+from cnpgen.arrays import Array
+from cnpgen.errors import UsageError
+from cnpgen.problems.scenes.placement import moved_obstacle
 from cnpgen.problems.scenes.scene_problem import MAX_SCENE_OBSTACLES, SceneError
 from cnpgen.problems.scenes.yaml_document import part, scalar, vector
 from cnpgen.robots.obstacle import Obstacle

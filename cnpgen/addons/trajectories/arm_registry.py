@@ -16,6 +16,7 @@ import numpy as np
 from cnpgen.arrays import Array
 from cnpgen.errors import UsageError, either, nearest
 
+BY_POSITION = "slope", "offset", "lower_end", "upper_end"  # of velocity limits
 VENDOR = "vendor"  # the basis of a limit that is a fact
 QUANTITIES = {"position": "rad", "velocity": "rad/s", "acceleration": "rad/s^2"}
 
@@ -29,12 +30,15 @@ class ArmLimit:
         upper: Largest values, shape (n,).
         basis: Who states them: "vendor", "urdf" or "guess".
         source: Document that states them.
+        by_position: Slopes, offsets, lower and upper ends of velocity limits that depend
+            on the position, shape (4, n); see ``velocity_by_position``.
     """
 
     lower: Array
     upper: Array
     basis: str
     source: str
+    by_position: Array | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -96,7 +100,14 @@ def _arm(name: str, data: Mapping[str, Any]) -> RecordedArm:
             entry = data[quantity]
             upper = np.array(entry["upper"], float)
             lower = np.array(entry.get("lower", -upper), float)
-            limits[quantity] = ArmLimit(lower, upper, entry["basis"], entry["source"])
+            by_position = (
+                np.array([entry[key] for key in BY_POSITION], float)
+                if BY_POSITION[0] in entry
+                else None
+            )
+            limits[quantity] = ArmLimit(
+                lower, upper, entry["basis"], entry["source"], by_position
+            )
     noise = data.get("noise", {})
     return RecordedArm(
         name,

@@ -8,7 +8,7 @@ accelerations are for review at most. Actions are targets, and only checked for 
 """
 
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from enum import StrEnum
 from itertools import islice
 from typing import Any
@@ -23,12 +23,15 @@ from cnpgen.addons.trajectories.arm_registry import (
 )
 from cnpgen.addons.trajectories.episode_files import Episode
 from cnpgen.addons.trajectories.lower_bounds import (
+    LAGS,
     MeanDerivatives,
     first_derivatives,
     second_derivatives,
+    swing_velocities,
     value_intervals,
 )
 from cnpgen.addons.trajectories.sample_errors import rounding, time_rounding
+from cnpgen.addons.trajectories.velocity_by_position import span_limits
 from cnpgen.arrays import Array
 
 NOMINAL_LAGS = (
@@ -221,12 +224,10 @@ def _limit_findings(
     # Half of a stall on either side of two frames.
     largest = max(jitter, MAX_STALL_S / 2) if is_assumed else jitter
     basis = f"{text}; jitter {jitter:.2g} s"
-    bounds = {
-        "position": value_intervals(episode.t, q, error),
-        "velocity": first_derivatives(episode.t, q, error, jitter),
-        "acceleration": second_derivatives(episode.t, q, error, jitter),
-    }
-    for quantity, found in bounds.items():
+    samples = _Samples(
+        episode.t, q, error, NOMINAL_LAGS if episode.is_nominal else None
+    )
+    for quantity, unit in QUANTITIES.items():
         limit = arm.limits.get(quantity)
         if limit is None:
             not_run[quantity] = f"no source states a limit of {arm.name}"
@@ -234,29 +235,63 @@ def _limit_findings(
         if quantity == "position" and not scale.has_zero:
             not_run[quantity] = "the zero of the joints is not known"
             continue
-        lags = NOMINAL_LAGS if episode.is_nominal else None
-        worst = _worst(limit, islice(found, lags))
-        if worst is None:
-            continue
+        worst = _worst(limit, samples.compared(quantity, limit, jitter))
         # Only limits of the vendor exclude, with a known noise, and not of
         # accelerations.
         proven = known and limit.basis == VENDOR and quantity != "acceleration"
+        if worst is None and quantity == "velocity":
+            # Over many frames, a recorder that falls behind explains the excess, too.
+            far, proven = replace(samples, lags=None), False
+            worst = _worst(limit, far.compared(quantity, limit, jitter))
+        if worst is None:
+            continue
         # A velocity that a stall of the recorder explains is for review.
         if proven and quantity == "velocity" and largest > jitter:
-            stalled = first_derivatives(episode.t, q, error, largest)
-            proven = (of_stall := _worst(limit, islice(stalled, lags))) is not None
-            worst = of_stall or worst
+            of_stall = _worst(limit, samples.compared(quantity, limit, largest))
+            proven, worst = of_stall is not None, of_stall or worst
         joint, time, value, bound = worst
         word = "at least" if value >= bound else "at most"
-        unit = QUANTITIES[quantity]
         yield EpisodeFinding(
             Level.EXCLUDE if proven else Level.REVIEW,
             quantity,
             arm.joints[joint],
             time,
-            f"{word} {value:.3g} {unit} at {time:.2f} s, limit {bound:.3g}",
+            f"{word} {value:.3g} {unit} at {time:.2f} s, limit {bound:.3g}"
+            + (" at these positions" if limit.by_position is not None else ""),
             f"limit: {limit.basis}, {limit.source}; {basis}",
         )
+
+
+@dataclass(frozen=True, eq=False)
+class _Samples:
+    """Positions of joints [rad], shape (K, n), at times [s], their error, and the number of lags that are used."""
+
+    t: Array
+    q: Array
+    error: float
+    lags: int | None
+
+    def compared(
+        self, quantity: str, limit: ArmLimit, jitter: float
+    ) -> Iterator[tuple[MeanDerivatives, Array, Array]]:
+        """Yield bounds of a quantity of every curve, with the lower and upper limits that hold for each."""
+        t, q, e = self.t, self.q, self.error
+        if quantity == "position":
+            found = value_intervals(t, q, e)
+        elif quantity == "velocity":
+            found = first_derivatives(t, q, e, jitter)
+        else:
+            found = second_derivatives(t, q, e, jitter)
+        for lag, bounds in zip(LAGS, islice(found, self.lags), strict=False):
+            lower, upper = limit.lower, limit.upper
+            if limit.by_position is not None:
+                lower, upper = span_limits(q, lag, e, limit.by_position, upper)
+            yield bounds, lower, upper
+        if quantity == "velocity" and jitter:
+            # Two spans of one frame are within two frames.
+            swings = swing_velocities(t, q, e, jitter)
+            for bounds in islice(swings, self.lags and self.lags // 2):
+                yield bounds, limit.lower, limit.upper
 
 
 def _noise(q: Array, arm: RecordedArm, noise: float | None) -> tuple[float, bool, str]:
@@ -272,17 +307,14 @@ def _noise(q: Array, arm: RecordedArm, noise: float | None) -> tuple[float, bool
 
 
 def _worst(
-    limit: ArmLimit, found: Iterator[MeanDerivatives]
+    limit: ArmLimit, found: Iterator[tuple[MeanDerivatives, Array, Array]]
 ) -> tuple[int, float, float, float] | None:
     """Return joint, time, bound and limit of the largest relative excess, or None."""
     best: tuple[float, int, float, float, float] | None = None
-    for bounds in found:
-        for values, ends, sign in (
-            (bounds.low, limit.upper, 1),
-            (bounds.high, limit.lower, -1),
-        ):
-            # Excess relative to the range makes joints of different ranges comparable.
-            scale = np.maximum(limit.upper - limit.lower, 1e-9)
+    # Excess relative to the range makes joints of different ranges comparable.
+    scale = np.maximum(limit.upper - limit.lower, 1e-9)
+    for bounds, lower, upper in found:
+        for values, ends, sign in ((bounds.low, upper, 1), (bounds.high, lower, -1)):
             excess = sign * (values - ends) / scale
             # Bounds that say nothing are infinite.
             excess = np.where(np.isfinite(excess), excess, -np.inf)
@@ -290,5 +322,6 @@ def _worst(
             size = float(excess[k, joint])
             if size > (best[0] if best else MIN_EXCESS):
                 time, value = float(bounds.t[k]), float(values[k, joint])
-                best = size, int(joint), time, value, float(ends[joint])
+                end = float(np.broadcast_to(ends, excess.shape)[k, joint])
+                best = size, int(joint), time, value, end
     return None if best is None else best[1:]

@@ -115,8 +115,9 @@ def _draw_trajectory(
     index: int | None,
     labels: tuple[str, ...],
 ) -> None:
-    """Draw a trajectory, by default the first that is not valid, and mark what is not valid."""
+    """Draw a trajectory, by default the first that is not valid, and mark its violations."""
     from cnpgen.addons.trajectories.trajectory_plot import plot_trajectory
+    from cnpgen.addons.trajectories.trajectory_verdict import Decision
     from cnpgen.plans import open_problem
 
     first = next(
@@ -127,7 +128,7 @@ def _draw_trajectory(
     margins = [
         entry.margin
         for entry in verdict.conditions.values()
-        if entry.is_measured and not entry.margin.ok
+        if entry.is_measured and entry.decision == Decision.INVALID
     ]
     problem, robot = open_problem(found.problem)
     title = f"{problem.name}, {labels[chosen]}: {trajectory.duration:.3f} s\n{verdict}"

@@ -9,7 +9,7 @@ without phases has the share of its duration as phase.
 from collections.abc import Sequence
 from dataclasses import replace
 from itertools import chain, product
-from typing import cast
+from typing import TypeVar, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -52,6 +52,7 @@ from cnpgen.judges.plans.sampling import (
     times,
 )
 from cnpgen.judges.plans.verdict import ZERO_TOLERANCE, Margin, Reason
+from cnpgen.problems.constraints.constraint import Constraint
 from cnpgen.problems.constraints.joint import JointTorque
 from cnpgen.problems.obstacles import scene_of
 from cnpgen.problems.problem import Problem
@@ -59,6 +60,8 @@ from cnpgen.robots.robot import Robot
 from cnpgen.robots.solid import pose_width
 from cnpgen.world.path import PathWorld
 from cnpgen.world.world import World
+
+Kind = TypeVar("Kind", bound=Constraint)
 
 MIN_SPAN_PARTS = 2  # between two knots
 
@@ -86,12 +89,13 @@ class FamilyJudge:
             else self._limits.scaled(dict(zip(names, parameters, strict=True)))
         )
 
+    def constraints(self, kind: type[Kind]) -> list[Kind]:
+        """Return the constraints of a kind."""
+        return [each for each in self._problem.constraint if type(each) is kind]
+
     def torque_limit(self) -> TorqueLimit | None:
         """Return the limit of torques of the rigid body at the joints, or None."""
-        constraint = next(
-            (each for each in self._problem.constraint if type(each) is JointTorque),
-            None,
-        )
+        constraint = next(iter(self.constraints(JointTorque)), None)
         if constraint is None:
             return None
         conditions = constraint.measured(cast(World, self._moved))

@@ -46,6 +46,7 @@ from cnpgen.addons.trajectories.trajectory_verdict import (
     Decision,
     TrajectoryVerdict,
 )
+from cnpgen.addons.trajectories.velocity_by_position import VelocityByPosition
 from cnpgen.addons.trajectories.witness import witness
 from cnpgen.arrays import Array
 from cnpgen.judges.plans.bernstein import find_maximum
@@ -73,11 +74,11 @@ def refute(
     # Bounds by positions alone come first: they hold whatever the velocities are.
     found = refuted_limits(limits, alone, errors)
     if found or trajectory.dq is None:
-        found = found or _refuted_torques(judge, trajectory, errors, limits)
+        found = found or _refuted_further(judge, trajectory, errors, limits)
         return _refutation(trajectory, found) if found else None
     found = refuted_limits(limits, trajectory, errors)
     if not found:
-        found = _refuted_torques(judge, trajectory, errors, limits)
+        found = _refuted_further(judge, trajectory, errors, limits)
         return _refutation(trajectory, found) if found else None
     # Positions alone refute nothing: velocities are at fault, or both columns disagree.
     worst = next((each for each in found if each.samples == BOTH), found[0])
@@ -223,14 +224,18 @@ def _joint_limit_excess(curve: CurveFamily, limits: ProvenJointLimits) -> str | 
     return None
 
 
-def _refuted_torques(
+def _refuted_further(
     judge: FamilyJudge,
     trajectory: Trajectory,
     errors: SampleErrors,
     limits: ProvenJointLimits,
 ) -> list[RefutedLimit]:
-    """Return the torque limit that no curve within the other joint limits meets."""
-    allowed, largest = judge.torque_limit(), largest_values(limits)
+    """Return the limit by position, or the torque limit, that no curve within the other joint limits meets."""
+    largest = largest_values(limits)
+    for each in judge.constraints(VelocityByPosition):
+        if speed := each.refuted(trajectory, errors, largest["dq"], limits.joints):
+            return [speed]
+    allowed = judge.torque_limit()
     error = with_jitter(errors, limits, replace(trajectory, dq=None, ddq=None)).q
     if allowed is None or not np.isfinite(error):
         return []

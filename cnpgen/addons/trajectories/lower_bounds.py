@@ -60,6 +60,22 @@ def first_derivatives(
         yield MeanDerivatives(low, high, (t[lag:] + t[:-lag]) / 2)
 
 
+def swing_velocities(
+    t: Array, y: Array, error: float, jitter: float
+) -> Iterator[MeanDerivatives]:
+    """Yield bounds of |dy/dt| of curves that move to and fro over two spans.
+
+    The way |D_1| + |D_2| - 4 e takes at most h_1 + h_2 + 2 d: the time in the middle
+    counts once, so the jitter lowers the bound less than that of either span.
+    """
+    e = with_rounding(y, error)
+    for lag in _lags(len(t), 2):
+        change = np.abs(y[lag:] - y[:-lag])
+        way = np.maximum(change[lag:] + change[:-lag] - 4 * e, 0.0)
+        least = way / ((t[2 * lag :] - t[: -2 * lag])[:, None] + 2 * jitter)
+        yield MeanDerivatives(least, -least, t[lag:-lag])
+
+
 def second_derivatives(
     t: Array, y: Array, error: float, jitter: float = 0.0
 ) -> Iterator[MeanDerivatives]:

@@ -182,6 +182,8 @@ def write_json(
 
 def summary_text(file: Path, found: "TrajectoryEvaluation") -> str:
     """Return the counts, and for every condition the decisions with the worst margin."""
+    from cnpgen.addons.trajectories.contradicting_columns import CONTRADICTION
+
     counts = ", ".join(
         f"{count:,} {statement}" for statement, count in found.statements.items()
     )
@@ -226,13 +228,13 @@ def summary_text(file: Path, found: "TrajectoryEvaluation") -> str:
     if summary["conditions"]:
         lines += [*table(decided, indent="  ", right=(1, 2, 3, 4, 5)), ""]
         lines += table(margins, indent="  ", right=(1, 2, 3, 5, 6))
-    lines += [
-        "",
-        *(
-            f"  {count:,} because of: {reason}"
-            for reason, count in summary["reasons"].items()
-        ),
-    ]
+    # Of each reason, the first proof is printed.
+    proofs = {v.reason: f": {v.detail}" for v in reversed(found.verdicts) if v.detail}
+    lines.append("")
+    for reason, count in summary["reasons"].items():
+        lines.append(f"  {count:,} because of: {reason}{proofs.get(reason, '')}")
+    if CONTRADICTION in summary["reasons"]:
+        lines.append("  --ignore-velocities judges the positions alone")
     return "\n".join(lines).rstrip()
 
 

@@ -5,6 +5,8 @@ import json
 import sys
 from collections.abc import Callable, Sequence
 from contextlib import suppress
+from http import HTTPStatus
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from threading import Lock
 from typing import Any
@@ -81,77 +83,8 @@ def serve(
             taken.
         ready: Called with the address once it is served.
     """
-    from http import HTTPStatus
-    from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
-
-    # Pages are drawn one after the other.
-    drawing = Lock()
-
-    class Handler(BaseHTTPRequestHandler):
-        timeout = _CONNECTION_TIME_S  # of every read and write
-
-        def do_GET(self) -> None:
-            try:
-                address = urlsplit(self.path)
-            except ValueError:  # such as "http://["
-                self._answer("not an address", status=HTTPStatus.BAD_REQUEST)
-                return
-            if (self.headers.get("Host") or "").rpartition(":")[0] not in _NAMES:
-                self._answer(
-                    "expected the address of this machine", status=HTTPStatus.FORBIDDEN
-                )
-            elif address.path == "/stamp":
-                self._answer(stamp(watched))
-            elif address.path == "/":
-                self._show(parse_qs(address.query).get("row", [""])[-1])
-            else:
-                self._answer("there is one page, /", status=HTTPStatus.NOT_FOUND)
-
-        def _show(self, row: str) -> None:
-            try:
-                if row and not (
-                    row.isascii() and row.isdigit() and len(row) <= _MAX_ROW_DIGITS
-                ):
-                    raise UsageError(f"row: expected a number from 0, got {row[:20]!r}")
-                with drawing:
-                    text = page(int(row) if row else None, stamp(watched))
-                self._answer(text, kind="text/html")
-            except CnpgenError as error:
-                self._answer(str(error), status=HTTPStatus.INTERNAL_SERVER_ERROR)
-
-        def _answer(
-            self,
-            text: str,
-            *,
-            kind: str = "text/plain",
-            status: HTTPStatus = HTTPStatus.OK,
-        ) -> None:
-            body = text.encode()
-            self.send_response(status)
-            self.send_header("Content-Type", f"{kind}; charset=utf-8")
-            self.send_header("Content-Length", str(len(body)))
-            self.send_header("Cache-Control", "no-store")
-            if status is HTTPStatus.INTERNAL_SERVER_ERROR:
-                self.send_header("Refresh", str(_RETRY_S))
-            self.end_headers()
-            self.wfile.write(body)
-
-        def log_message(self, *_: object) -> None:
-            """Do not log requests."""
-
-    class Server(ThreadingHTTPServer):
-        # An idle connection does not delay the end.
-        daemon_threads = True
-
-        def handle_error(self, request: object, client_address: object) -> None:  # noqa: ARG002
-            """Report an error of one connection in one line; clients that leave are no error."""
-            error = sys.exception()
-            if not isinstance(error, ConnectionError | TimeoutError):
-                text = f"{type(error).__name__}: {error}".partition("\n")[0]
-                print(f"cnpgen: --serve: {text[:200]}", file=sys.stderr)
-
     try:
-        server = Server((HOST, port), Handler)
+        server = _Server(page, watched, port)
     except OSError as error:
         raise MachineError(
             f"--serve: cannot listen on port {port}: {error.strerror}"
@@ -159,6 +92,86 @@ def serve(
     with server:
         ready(f"http://{HOST}:{server.server_port}/")
         server.serve_forever()
+
+
+class _Handler(BaseHTTPRequestHandler):
+    """Answers to the requests of one connection."""
+
+    timeout = _CONNECTION_TIME_S  # of every read and write
+    server: "_Server"
+
+    def do_GET(self) -> None:
+        """Answer a request."""
+        try:
+            address = urlsplit(self.path)
+        except ValueError:  # such as "http://["
+            self._answer("not an address", status=HTTPStatus.BAD_REQUEST)
+            return
+        if (self.headers.get("Host") or "").rpartition(":")[0] not in _NAMES:
+            self._answer(
+                "expected the address of this machine", status=HTTPStatus.FORBIDDEN
+            )
+        elif address.path == "/stamp":
+            self._answer(stamp(self.server.watched))
+        elif address.path == "/":
+            self._show(parse_qs(address.query).get("row", [""])[-1])
+        else:
+            self._answer("there is one page, /", status=HTTPStatus.NOT_FOUND)
+
+    def _show(self, row: str) -> None:
+        try:
+            if row and not (
+                row.isascii() and row.isdigit() and len(row) <= _MAX_ROW_DIGITS
+            ):
+                raise UsageError(f"row: expected a number from 0, got {row[:20]!r}")
+            self._answer(self.server.draw(int(row) if row else None), kind="text/html")
+        except CnpgenError as error:
+            self._answer(str(error), status=HTTPStatus.INTERNAL_SERVER_ERROR)
+
+    def _answer(
+        self,
+        text: str,
+        *,
+        kind: str = "text/plain",
+        status: HTTPStatus = HTTPStatus.OK,
+    ) -> None:
+        body = text.encode()
+        self.send_response(status)
+        self.send_header("Content-Type", f"{kind}; charset=utf-8")
+        self.send_header("Content-Length", str(len(body)))
+        self.send_header("Cache-Control", "no-store")
+        if status is HTTPStatus.INTERNAL_SERVER_ERROR:
+            self.send_header("Refresh", str(_RETRY_S))
+        self.end_headers()
+        self.wfile.write(body)
+
+    def log_message(self, *_: object) -> None:
+        """Do not log requests."""
+
+
+class _Server(ThreadingHTTPServer):
+    """Server of a page and of the stamp of the files that it depends on."""
+
+    # An idle connection does not delay the end.
+    daemon_threads = True
+
+    def __init__(self, page: Page, watched: Sequence[Path], port: int) -> None:
+        self.watched, self._page = watched, page
+        # Pages are drawn one after the other.
+        self._drawing = Lock()
+        super().__init__((HOST, port), _Handler)
+
+    def draw(self, row: int | None) -> str:
+        """Draw the page."""
+        with self._drawing:
+            return self._page(row, stamp(self.watched))
+
+    def handle_error(self, request: object, client_address: object) -> None:  # noqa: ARG002
+        """Report an error of one connection in one line; clients that leave are no error."""
+        error = sys.exception()
+        if not isinstance(error, ConnectionError | TimeoutError):
+            text = f"{type(error).__name__}: {error}".partition("\n")[0]
+            print(f"cnpgen: --serve: {text[:200]}", file=sys.stderr)
 
 
 def stamp(watched: Sequence[Path]) -> str:

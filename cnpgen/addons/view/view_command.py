@@ -122,11 +122,6 @@ def _scene(arguments: argparse.Namespace) -> "ViewScene":
         holds_trajectories,
         is_trajectory_file,
     )
-    from cnpgen.addons.view.view_scene import scene_of_plans, scene_of_problem
-    from cnpgen.plans import open_problem
-    from cnpgen.plans.evaluate import evaluate_plans
-    from cnpgen.problems.load_robot import load_robot
-    from cnpgen.problems.problem_file import load_problem_behind
     from cnpgen.store.files.kind import HDF5_SUFFIXES
     from cnpgen.store.paths import file_kind
 
@@ -143,17 +138,35 @@ def _scene(arguments: argparse.Namespace) -> "ViewScene":
         return _scene_of_trajectories(arguments, rows)
     refuse_trajectory_options(arguments, what)
     if not what.is_dir() and not file_kind(what) and what.suffix not in HDF5_SUFFIXES:
-        extra = [
-            name
-            for name in ("row", "rows", "split", "problem")
-            if getattr(arguments, name) is not None
-        ]
-        if extra:
+        return _scene_of_problem(arguments)
+    return _scene_of_plans(arguments, what, rows)
+
+
+def _scene_of_problem(arguments: argparse.Namespace) -> "ViewScene":
+    """Build the scene of a problem, or of the problem of another recipe."""
+    from cnpgen.addons.view.view_scene import scene_of_problem
+    from cnpgen.problems.load_robot import load_robot
+    from cnpgen.problems.problem_file import load_problem_behind
+
+    for name in ("row", "rows", "split", "problem"):
+        if getattr(arguments, name) is not None:
             raise UsageError(
-                f"--{extra[0]} needs plans or the folder of a dataset, got {arguments.what}"
+                f"--{name} needs plans or the folder of a dataset, got {arguments.what}"
             )
-        problem = load_problem_behind(arguments.what)
-        return scene_of_problem(problem, load_robot(problem))
+    problem = load_problem_behind(arguments.what)
+    return scene_of_problem(problem, load_robot(problem))
+
+
+def _scene_of_plans(
+    arguments: argparse.Namespace, what: Path, rows: Sequence[int]
+) -> "ViewScene":
+    """Build the scene of samples or plans with their verdicts."""
+    from cnpgen.addons.view.view_scene import scene_of_plans
+    from cnpgen.plans import open_problem
+    from cnpgen.plans.evaluate import evaluate_plans
+    from cnpgen.problems.load_robot import load_robot
+    from cnpgen.problems.problem_file import load_problem_behind
+
     plans, count = (
         _samples(arguments, rows) if what.is_dir() else _plans(arguments, rows)
     )

@@ -31,6 +31,7 @@ if TYPE_CHECKING:
 TABLE_HEIGHT = "table height"  # drawn with the tip
 PLOT_SAMPLES = 1000  # in time
 DRAWN_STATES = 7  # at which the arm and the object are drawn
+MAX_NAMED_CURVES = 6  # more names would cover each other
 MAX_LEGEND_CHARACTERS = 115  # that fit above the curves
 _START, _BETWEEN, _GOAL, _LIMIT, _BOX = "tab:blue", "0.55", "tab:red", "0.25", "0.85"
 
@@ -281,9 +282,9 @@ def _draw_values(axis: "Axes", curve: ConditionCurve, t: Array) -> None:
     for values, part in zip(curve.values, curve.parts, strict=True):
         color, label = None if part else "black", part or None
         axis.plot(t, values, linewidth=1.2, color=color, label=label)
-        axis.annotate(
-            part, (t[0], values[0]), (2, 3), textcoords="offset points", fontsize=8
-        )
+        if len(curve.parts) <= MAX_NAMED_CURVES:
+            at = (t[0], values[0])
+            axis.annotate(part, at, (2, 3), textcoords="offset points", fontsize=8)
     # A bound of which the values stay far away is drawn, too.
     low, high = axis.get_ylim()
     for bound, side in ((curve.lower, -1), (curve.upper, 1)):
@@ -335,12 +336,8 @@ def _draw_over_table(
     above, beside = figure.subplots(2, 1, height_ratios=[1.5, 1.0])
     x, y, z = world.parameters.on_table(world.tip_position)
     low, high = table.bounds_of(world.parameters.values)
-    width, height = high[0] - low[0], high[1] - low[1]
-    above.add_patch(
-        Rectangle(
-            (low[0], low[1]), width, height, fill=False, edgecolor=_LIMIT, zorder=0
-        )
-    )
+    sizes = high[0] - low[0], high[1] - low[1]
+    above.add_patch(Rectangle(low, *sizes, fill=False, edgecolor=_LIMIT, zorder=0))
     _draw_tip_path(above, x, y)
     above.set_aspect("equal")
     above.margins(0.08)
@@ -359,7 +356,10 @@ def _draw_over_table(
     beside.fill_between(
         t, -band, band, color="tab:green", alpha=0.12, linewidth=0, label="valid"
     )
-    beside.plot(t, 1e3 * (z - table.z), color="black", linewidth=1.2)
+    height = 1e3 * (z - table.z)
+    beside.plot(t, height, color="black", linewidth=1.2)
+    violated = np.where(np.abs(height) > band, height, np.nan)
+    beside.plot(t, violated, color=_GOAL, linewidth=2.5, label="_violated")
     beside.set(xlabel="t [s]", ylabel="z above the table [mm]", xlim=(t[0], t[-1]))
     beside.grid(color="0.9", linewidth=0.6)
 

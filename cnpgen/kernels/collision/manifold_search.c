@@ -143,7 +143,7 @@ static long shorten_on_manifold(search *h, manifold *m, double *path, long count
   return count;
 }
 
-/* Search for a path of projected states from start to goal; see `find_path`. `scene` are the values for BLOCK states. */
+/* Search for a path of projected states from start to any goal; see `find_path`. `scene` are the values for BLOCK states. */
 long find_manifold_path(const tree_settings *s, kernel *residuals, const double *scene, long rows, double accuracy,
                         double *path, long max_points) {
   long n = s->scene->n, count = 0;
@@ -153,13 +153,15 @@ long find_manifold_path(const tree_settings *s, kernel *residuals, const double 
   manifold m = {residuals, scene, rows, accuracy, numbers, numbers + BLOCK * n, numbers + BLOCK * (n + rows)};
   tree trees[2] = {make_tree(n), make_tree(n)};
   int reached = 0, lacks_memory = !h.m || !h.q || !numbers || !target;
-  add_node(trees, s->start, -1), add_node(trees + 1, s->goal, -1);
+  add_roots(trees, s);
   lacks_memory |= trees[0].lacks_memory || trees[1].lacks_memory;
   /* Similar seeds give similar first numbers of xorshift; they are discarded. */
   for (int i = 0; i < 10; i++) uniform(&h);
-  long end = lacks_memory ? -1 : follow(&h, &m, trees, 0, s->goal, INFINITY, &reached);
+  long end = -1, last = 0;
+  for (long g = 0; g < s->goals && !lacks_memory && !reached; g++)
+    last = g, end = follow(&h, &m, trees, 0, s->goal + n * g, INFINITY, &reached);
   if (lacks_memory || trees[0].lacks_memory) count = OUT_OF_MEMORY;
-  else if (reached) count = join(trees, end, 0, path, max_points);
+  else if (reached) count = join(trees, end, last, path, max_points);
   for (long trial = 0; trial < s->max_extensions && trees[0].count + trees[1].count < s->max_nodes && !count; trial++) {
     /* The trees take turns. */
     int own = trial % 2;
@@ -175,8 +177,9 @@ long find_manifold_path(const tree_settings *s, kernel *residuals, const double 
     count = own ? join(trees, far, node, path, max_points) : join(trees, node, far, path, max_points);
   }
   if (count > 2) count = shorten_on_manifold(&h, &m, path, count);
-  /* The last state is on the manifold up to the tolerance only; the path must end at the goal itself. */
-  if (count > 0) memcpy(path + n * (count - 1), s->goal, n * sizeof(double));
+  /* The last state is on the manifold up to the tolerance only; the path must end at the goal itself: the nearest one. */
+  tree goals = {s->goals, s->goals, n, (double *)s->goal, NULL, 0};
+  if (count > 0) memcpy(path + n * (count - 1), s->goal + n * nearest_node(&goals, path + n * (count - 1)), n * sizeof(double));
   free_tree(trees), free_tree(trees + 1);
   free(target), free(numbers), free(h.q), free_memory(h.m);
   return count;

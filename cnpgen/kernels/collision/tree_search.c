@@ -1,7 +1,7 @@
 /* Joint-space paths among obstacles by RRT-Connect (Kuffner and LaValle 2000); collision.c precedes this file.
 
 Edges are checked as a whole, in bisection order, so that collisions show early. The required distances grow by a margin away
-from both ends, where the clearance may be smaller. Paths are shortened by straight lines between random points if that reduces
+from all ends, where the clearance may be smaller. Of several goals every one is a root of the second tree. Paths are shortened by straight lines between random points if that reduces
 their estimated duration. */
 
 typedef struct {
@@ -12,6 +12,7 @@ typedef struct {
   long max_extensions, max_nodes, shortcuts;             /* nodes of both trees */
   double corner_time;                                    /* that a corner costs [s] */
   unsigned long long seed;
+  long goals; /* rows of `goal` */
 } tree_settings;
 
 typedef struct {
@@ -50,7 +51,8 @@ static int state_is_clear(search *h, const double *q) {
   const tree_settings *s = h->s;
   long n = s->scene->n;
   /* At an end the clearance may be as small as the problem permits; the margin rises linearly with the distance from it. */
-  double away = fmin(largest_difference(q, s->start, n), largest_difference(q, s->goal, n));
+  double away = largest_difference(q, s->start, n);
+  for (long g = 0; g < s->goals; g++) away = fmin(away, largest_difference(q, s->goal + n * g, n));
   double margin = s->ramp > 0 ? s->margin * fmin(1.0, away / s->ramp) : s->margin;
   return is_clear(s->scene, h->m, q, s->obstacle_distance + margin, s->self_distance + margin);
 }
@@ -114,7 +116,13 @@ static long extend(search *h, tree *t, long node, const double *target, double *
   return line_is_clear(h, from, fresh, 1) ? add_node(t, fresh, node) : -1;
 }
 
-/* Write the path from the root of tree 0 over its node a and node b of tree 1 to its root; return its length. */
+/* Add the start and the goals as roots of two trees. */
+static void add_roots(tree *trees, const tree_settings *s) {
+  add_node(trees, s->start, -1);
+  for (long g = 0; g < s->goals; g++) add_node(trees + 1, s->goal + s->scene->n * g, -1);
+}
+
+/* Write the path from the root of tree 0 over its node a and node b of tree 1 to the root of b; return its length. */
 static long join(const tree *trees, long a, long b, double *path, long max_points) {
   long n = trees->n, count = 0, points = 0;
   for (long i = a; i >= 0; i = trees[0].parent[i]) count++;
@@ -183,20 +191,33 @@ static long shorten(search *h, double *path, long count, double *copy, long max_
   return count;
 }
 
-/* Search for a path from start to goal; return its number of points, at most max_points, 0 if there is none, or
+/* Return the index of the fastest clear straight line from the start to a goal, or -1. */
+static long fastest_line(search *h) {
+  const tree_settings *s = h->s;
+  long n = s->scene->n, fastest = -1;
+  double least = INFINITY;
+  for (long g = 0; g < s->goals; g++) {
+    double duration = line_time(s, s->start, s->goal + n * g);
+    if (duration < least && line_is_clear(h, s->start, s->goal + n * g, 0)) least = duration, fastest = g;
+  }
+  return fastest;
+}
+
+/* Search for a path from start to any goal; return its number of points, at most max_points, 0 if there is none, or
 OUT_OF_MEMORY. */
 long find_path(const tree_settings *s, double *path, long max_points) {
   long n = s->scene->n, count = 0;
   search h = {s, make_memory(s->scene), s->seed * 0x9E3779B97F4A7C15ull + 88172645463325252ull, malloc(n * sizeof(double))};
   double *target = malloc(n * sizeof(double)), *fresh = malloc(n * sizeof(double));
   tree trees[2] = {make_tree(n), make_tree(n)};
-  add_node(trees, s->start, -1), add_node(trees + 1, s->goal, -1);
+  add_roots(trees, s);
   int lacks_memory = !h.m || !h.q || !target || !fresh || trees[0].lacks_memory || trees[1].lacks_memory;
   for (int i = 0; i < 10; i++) uniform(&h);
-  if (lacks_memory) count = OUT_OF_MEMORY;
   /* Most pairs of states need no tree. */
-  else if (line_is_clear(&h, s->start, s->goal, 0)) {
-    memcpy(path, s->start, n * sizeof(double)), memcpy(path + n, s->goal, n * sizeof(double));
+  long line = lacks_memory ? -1 : fastest_line(&h);
+  if (lacks_memory) count = OUT_OF_MEMORY;
+  else if (line >= 0) {
+    memcpy(path, s->start, n * sizeof(double)), memcpy(path + n, s->goal + n * line, n * sizeof(double));
     count = 2;
   }
   for (long trial = 0; trial < s->max_extensions && trees[0].count + trees[1].count < s->max_nodes && !count; trial++) {

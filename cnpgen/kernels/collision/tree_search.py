@@ -31,7 +31,7 @@ class _TreeSettings(ctypes.Structure):
         ),
         *((name, c_double) for name in ("spacing", "extension")),
         *((name, c_long) for name in ("max_extensions", "max_nodes", "shortcuts")),
-        *(("corner_time", c_double), ("seed", c_ulonglong)),
+        *(("corner_time", c_double), ("seed", c_ulonglong), ("goals", c_long)),
     )
 
 
@@ -91,10 +91,11 @@ def find_tree_path(
 ) -> Array | None:
     """Search for a path whose straight lines are clear; it is shortened by its estimated duration.
 
+    Of several goals, shape (G, n), all are roots of one tree: the path ends in any of them.
     On a manifold the path consists of projected states at small distances, and fewer of
     them make it shorter. The equalities must hold at both ends, which are not checked
-    themselves. Ends and the corners of the box of random configurations [rad] have
-    shape (n,), as velocity limits [rad/s] have.
+    themselves. The start, one goal and the corners of the box of random configurations
+    [rad] have shape (n,), as velocity limits [rad/s] have.
 
     Returns:
         Corners of the path [rad], shape (K, n), or None if the trees do not connect.
@@ -107,7 +108,12 @@ def find_tree_path(
     # Without a check the required distance is -inf, which every distance exceeds.
     numbers = [-np.inf if value is None else value for value in astuple(settings)]
     native = _TreeSettings(
-        checker.address, *map(address_of, arrays), *numbers, CORNER_TIME_S, seed + 1
+        checker.address,
+        *map(address_of, arrays),
+        *numbers,
+        CORNER_TIME_S,
+        seed + 1,
+        arrays[1].size // len(arrays[0]),
     )
     path = np.empty((MAX_PATH_POINTS, len(arrays[0])))
     count = _search(checker, native, manifold, path)

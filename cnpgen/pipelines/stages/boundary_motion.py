@@ -325,15 +325,13 @@ def table_acceleration(robot: Robot) -> Any:
     row = [column[2] for column in kin.jacobian]
     # Of all ddq with J_z ddq = c, the one with the smallest max_i |ddq_i| / limit_i has
     # all ratios equal: ddq_i = c / (sum_k limit_k |J_k|) * limit_i sign(J_i).
-    size = sum((bound * ca.fabs(x) for bound, x in zip(limit, row, strict=True)), 0.0)
+    pairs = list(zip(limit, row, strict=True))
+    size = sum((bound * ca.fabs(x) for bound, x in pairs), 0.0)
     share = -bias_acceleration(kin, dq)[2] / size
-    particular = [
-        share * bound * ca.sign(x) for bound, x in zip(limit, row, strict=True)
-    ]
+    particular = [share * bound * ca.sign(x) for bound, x in pairs]
     # A direction within the manifold: J_z u = 0, so that every t keeps the constraint.
-    direction = _project(
-        [x * bound for x, bound in zip(u, limit, strict=True)], row, limit
-    )
+    scaled = [x * bound for x, bound in zip(u, limit, strict=True)]
+    direction = _project(scaled, row, limit)
     # Torque is affine in ddq, so two evaluations give its value and its change with t.
     torque = inverse_dynamics(robot.chain, q, dq, particular)
     shifted = inverse_dynamics(robot.chain, q, dq, add(particular, direction))
@@ -343,8 +341,7 @@ def table_acceleration(robot: Robot) -> Any:
     )
     bounds = [*limit, *torque_bounds]
     low, high = _interval([*particular, *torques], [*direction, *changes], bounds)
-    t = low + s[0] * (high - low)
-    ddq = add(particular, scale(direction, t))
+    ddq = add(particular, scale(direction, low + s[0] * (high - low)))
     # t = 0, the particular solution, must be admissible; otherwise no solution is
     # sought.
     admissible = ca.logic_and(low <= 0, high >= 0)

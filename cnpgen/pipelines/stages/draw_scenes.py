@@ -65,26 +65,19 @@ class DrawScenes(Stage):
 
     def prepare(self, context: Context) -> StageFunction:
         self._check(context)
-        obstacles, capacity, shares = (
-            context.problem.obstacle,
-            sum(self.capacity.values()),
-            self._shares(),
-        )
+        obstacles, shares = context.problem.obstacle, self._shares()
+        capacity = sum(self.capacity.values())
 
         def work(candidates: CandidateBatch, random: np.random.Generator) -> None:
             count = max(round(candidates.size / self.per_scene), 1)
             # Each scene has its own seed: a family that draws more numbers changes no
             # other scene.
-            seeds, families = (
-                random.integers(0, 2**63, count),
-                random.choice(len(shares), count, p=shares),
-            )
+            seeds = random.integers(0, 2**63, count).tolist()
+            families = random.choice(len(shares), count, p=shares).tolist()
             with _paused_garbage_collection():
                 layouts = [
                     self.family[family].draw(np.random.Generator(np.random.SFC64(seed)))
-                    for family, seed in zip(
-                        families.tolist(), seeds.tolist(), strict=True
-                    )
+                    for family, seed in zip(families, seeds, strict=True)
                 ]
             fits = np.array([self._fits(layout) for layout in layouts], bool)
             # A scene with too many obstacles is replaced by an empty one and its
@@ -94,16 +87,14 @@ class DrawScenes(Stage):
                 for layout, fit in zip(layouts, fits, strict=True)
             ]
             candidates.scenes = batch_scenes(
-                kept, families.tolist(), obstacles, capacity, context.dtype
+                kept, families, obstacles, capacity, context.dtype
             )
             # Consecutive candidates share a scene; indices ascend, as ``are_clear``
             # requires.
-            candidates["scene"] = (candidates.alive * count // candidates.size)[
-                None
-            ].astype(float)
-            of_scene = np.stack(
-                [fits, base_depths(candidates.scenes.table) <= MAX_BASE_DEPTH_M]
-            )
+            scene = candidates.alive * count // candidates.size
+            candidates["scene"] = scene[None].astype(float)
+            free = base_depths(candidates.scenes.table) <= MAX_BASE_DEPTH_M
+            of_scene = np.stack([fits, free])
             candidates.reject_first(of_scene[:, candidates.scene], [TOO_MANY, AT_BASE])
 
         return work

@@ -236,9 +236,8 @@ def maximise(a: Vec, b: list[Vec], limit: list[float]) -> tuple[Vec, Scalar]:
         # The first of equal vertices stays.
         better = ca.logic_and(usable, value < best)
         best = ca.if_else(better, value, best)
-        y = [
-            ca.if_else(better, new, old) for new, old in zip(candidate, y, strict=True)
-        ]
+        pairs = zip(candidate, y, strict=True)
+        y = [ca.if_else(better, new, old) for new, old in pairs]
     # Complementary slackness: a joint with residual r_k != 0 is at the limit of its
     # sign.
     residual = [a[k] - dot(b[k], y) for k in range(n)]
@@ -249,11 +248,8 @@ def maximise(a: Vec, b: list[Vec], limit: list[float]) -> tuple[Vec, Scalar]:
     ]
     # The joints with residual 0 must satisfy the equations that the others leave.
     missing = [-dot([b[k][c] for k in range(n)], fixed) for c in range(2)]
-    rest = _smallest_ratio(
-        [[x * free for x in b_k] for b_k, free in zip(b, left, strict=True)],
-        limit,
-        missing,
-    )
+    left_rows = [[x * free for x in b_k] for b_k, free in zip(b, left, strict=True)]
+    rest = _smallest_ratio(left_rows, limit, missing)
     return [x + r for x, r in zip(fixed, rest, strict=True)], best
 
 

@@ -273,17 +273,8 @@ def braking_step(robot: Robot, *, height: float) -> Any:
     ddq = _knapsack([-x for x in along], row, target, low, high)
     speed = edge[0] * velocity[0] + edge[1] * velocity[1]
     deceleration = -(dot(along, ddq) + edge[0] * bias[0] + edge[1] * bias[1])
-    # Within the step the tip stops if v <= a T; a tip that moves away has stopped
-    # already.
-    stops = ca.logic_or(
-        speed <= 0,
-        ca.logic_and(deceleration > 0, speed <= deceleration * BRAKING_STEP_S),
-    )
-    now = edge[0] * kin.tip[0] + edge[1] * kin.tip[1] - edge[2]
-    # Stopping distance v^2 / (2 a).
-    end = now + ca.if_else(
-        speed > 0, 0.5 * speed * speed / ca.fmax(deceleration, 1e-9), 0.0
-    )
+    stops, distance = _stop(speed, deceleration)
+    end = edge[0] * kin.tip[0] + edge[1] * kin.tip[1] - edge[2] + distance
     # Constant acceleration over the step: q + T dq + T^2 ddq / 2.
     mean_rate = add(dq, scale(ddq, 0.5 * BRAKING_STEP_S))
     following = [
@@ -296,6 +287,18 @@ def braking_step(robot: Robot, *, height: float) -> Any:
         [state_sx, edge_sx],
         [ca.vertcat(*following), ca.if_else(stops, 0.0, 1.0)],
     )
+
+
+def _stop(speed: Scalar, deceleration: Scalar) -> tuple[Scalar, Scalar]:
+    """Build whether a speed [m/s] ends within a step, and its stopping distance [m]."""
+    import casadi as ca
+
+    # Within the step the tip stops if v <= a T; a tip that moves away has stopped
+    # already.
+    in_time = ca.logic_and(deceleration > 0, speed <= deceleration * BRAKING_STEP_S)
+    # Stopping distance v^2 / (2 a).
+    distance = 0.5 * speed * speed / ca.fmax(deceleration, 1e-9)
+    return ca.logic_or(speed <= 0, in_time), ca.if_else(speed > 0, distance, 0.0)
 
 
 def _acceleration_box(robot: Robot, dq: Vec) -> tuple[Vec, Vec]:

@@ -427,9 +427,7 @@ def pose_ik_step(robot: Robot) -> Any:
     import casadi as ca
 
     (q_sx, q), (p_sx, p), (r_sx, r) = (
-        symbols("q", robot.n),
-        symbols("p", 3),
-        symbols("r", 9),
+        symbols(name, width) for name, width in (("q", robot.n), ("p", 3), ("r", 9))
     )
     kin = forward_kinematics(robot.chain, q)
     target = [r[0:3], r[3:6], r[6:9]]

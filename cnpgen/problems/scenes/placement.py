@@ -53,28 +53,14 @@ def placed_scene(scene: SceneProblem, robot: Robot, start: Array) -> SceneProble
     if not request.places:
         return scene
     frames = LinkFrames(scene, robot, start)
-    obstacles, touchable = list[Obstacle](), list[AttachedObject]()
-    touching = request.obstacle_touch_links or ((),) * len(scene.obstacles)
-    for index, (each, names) in enumerate(zip(scene.obstacles, touching, strict=True)):
-        frame, what = request.frame_of(index), f"obstacle {each.name!r}"
-        pose = frames.pose(frame, what)
-        obstacle = moved_obstacle(each, pose) if frame else each
-        # An obstacle that links may touch becomes a fixed body of the robot, whose
-        # pairs can be left out.
-        if links := _moving(names, request, frames, f"an allowed collision of {what}"):
-            item = AttachedObject(each.name, "", (obstacle,), ("",), links)
-            touchable.append(item)
-        else:
-            obstacles.append(obstacle)
+    obstacles, touchable = _placed_obstacles(scene, frames)
     goal = scene.goal_pose
     if goal is not None:
         goal = _moved_goal(goal, request.goal_frame, frames)
     poses = scene.other_goal_poses
     origins = request.other_goal_frames or ("",) * len(poses)
-    others = tuple(
-        _moved_goal(pose, frame, frames)
-        for pose, frame in zip(poses, origins, strict=True)
-    )
+    pairs = zip(poses, origins, strict=True)
+    others = tuple(_moved_goal(pose, frame, frames) for pose, frame in pairs)
     for link, *_ in request.link_sizes:
         frames.check_link(link, "a padding or scale")
     carried = tuple(_in_link(each, request, frames) for each in request.attached)
@@ -99,6 +85,27 @@ def placed_scene(scene: SceneProblem, robot: Robot, start: Array) -> SceneProble
         request=plain,
     )
     return checked_scene(placed)
+
+
+def _placed_obstacles(
+    scene: SceneProblem, frames: LinkFrames
+) -> tuple[list[Obstacle], list[AttachedObject]]:
+    """Return the obstacles in the frame of the robot's base, and those that links may touch."""
+    request = scene.request
+    obstacles, touchable = list[Obstacle](), list[AttachedObject]()
+    touching = request.obstacle_touch_links or ((),) * len(scene.obstacles)
+    for index, (each, names) in enumerate(zip(scene.obstacles, touching, strict=True)):
+        frame, what = request.frame_of(index), f"obstacle {each.name!r}"
+        pose = frames.pose(frame, what)
+        obstacle = moved_obstacle(each, pose) if frame else each
+        # An obstacle that links may touch becomes a fixed body of the robot, whose
+        # pairs can be left out.
+        if links := _moving(names, request, frames, f"an allowed collision of {what}"):
+            item = AttachedObject(each.name, "", (obstacle,), ("",), links)
+            touchable.append(item)
+        else:
+            obstacles.append(obstacle)
+    return obstacles, touchable
 
 
 def _moved_goal(goal: GoalPose, frame: str, frames: LinkFrames) -> GoalPose:

@@ -60,14 +60,11 @@ def requested_problem(
     if payload is not None:
         mass = number("payload", payload)
         check_range("payload", mass, MIN_PAYLOAD_KG, MAX_PAYLOAD_KG, "kg")
+        attached = scenes[0].request.attached
+        if all(item.mass or not item.link for item in attached):
+            text = "the payload of %g kg is not used: no scene attaches an object of weight 0"
+            _LOG.warning(text, payload)
     first = scenes[0]
-    if payload is not None and all(
-        item.mass or not item.link for item in first.request.attached
-    ):
-        _LOG.warning(
-            "the payload of %g kg is not used: no scene attaches an object of weight 0",
-            payload,
-        )
     _report_held_joints(problem, scenes)
     # Plans of one call share limits, links and constraints, hence one problem.
     for scene in scenes:
@@ -84,9 +81,8 @@ def requested_problem(
     constraints = *problem.constraint, *first.request.constraints
     changed = _with_scales(problem, robot, first).replaced(constraint=constraints)
     if first.request.attached or first.request.link_sizes:
-        objects = [
-            _with_mass(item, problem, first, payload) for item in first.request.attached
-        ]
+        attached = first.request.attached
+        objects = [_with_mass(item, problem, first, payload) for item in attached]
         changed = _with_objects(changed, objects, first)
     actual = load_robot(changed)
     _check_contacts(actual, first)

@@ -149,23 +149,9 @@ def make_obstacle(
     where = f"{place}: obstacle {name!r}"
     if kind not in _SIZES:
         raise SceneError(f"{where} is a {kind}, expected one of {', '.join(KINDS)}")
-    sizes, position, wxyz = (
-        np.asarray(values, float) for values in (sizes, position, wxyz)
-    )
-    for what, values, count in (
-        ("size", sizes, _SIZES[kind]),
-        ("position", position, 3),
-        ("quaternion", wxyz, 4),
-    ):
-        if values.shape != (count,):
-            raise SceneError(
-                f"{where}: {what} must have {count} numbers, got {values.tolist()!r:.60}"
-            )
-        if not (np.abs(values) <= MAX_COORDINATE_M).all():
-            # Also false for nan.
-            raise SceneError(
-                f"{where}: {what} must be finite and at most {MAX_COORDINATE_M:g}, got {values.tolist()}"
-            )
+    sizes = _checked_numbers(where, "size", sizes, _SIZES[kind])
+    position = _checked_numbers(where, "position", position, 3)
+    wxyz = _checked_numbers(where, "quaternion", wxyz, 4)
     if (sizes < MIN_OBSTACLE_SIZE_M).any():
         raise SceneError(
             f"{where}: sizes must be at least {MIN_OBSTACLE_SIZE_M:g} m, got {sizes.tolist()}"
@@ -173,25 +159,32 @@ def make_obstacle(
     if text := quaternion_error(wxyz):
         raise SceneError(f"{where}: {text}")
     x, y, z = position.tolist()
-    turn = roll_pitch_yaw(rotation_matrix(wxyz))
+    placed = Obstacle(name=name, kind=kind, position=(x, y, z))
+    if kind == "sphere":
+        return replace(placed, radius=float(sizes[0]))
+    placed = replace(placed, rotation=roll_pitch_yaw(rotation_matrix(wxyz)))
     if kind == "box":
         a, b, c = sizes.tolist()
-        return Obstacle(
-            name=name, kind=kind, position=(x, y, z), rotation=turn, size=(a, b, c)
-        )
-    if kind == "sphere":
-        return Obstacle(
-            name=name, kind=kind, position=(x, y, z), radius=float(sizes[0])
-        )
+        return replace(placed, size=(a, b, c))
     radius, length = sizes.tolist()
-    return Obstacle(
-        name=name,
-        kind=kind,
-        position=(x, y, z),
-        rotation=turn,
-        radius=radius,
-        length=length,
-    )
+    return replace(placed, radius=radius, length=length)
+
+
+def _checked_numbers(
+    where: str, what: str, values: Sequence[float] | Array, count: int
+) -> Array:
+    """Return numbers of a file as an array; raise SceneError for another count or values that are not plausible."""
+    array = np.asarray(values, float)
+    if array.shape != (count,):
+        raise SceneError(
+            f"{where}: {what} must have {count} numbers, got {array.tolist()!r:.60}"
+        )
+    # Also false for nan.
+    if not (np.abs(array) <= MAX_COORDINATE_M).all():
+        raise SceneError(
+            f"{where}: {what} must be finite and at most {MAX_COORDINATE_M:g}, got {array.tolist()}"
+        )
+    return array
 
 
 @checked_arguments
@@ -217,33 +210,20 @@ def make_mesh(
         UsageError: An argument has another shape.
     """
     where = f"{place}: obstacle {name!r}" if place else f"obstacle {name!r}"
-    vertices, origin, turn = (
-        numbers("points", points),
-        numbers("position", position),
-        numbers("rotation", rotation),
-    )
+    vertices, origin = numbers("points", points), numbers("position", position)
+    turn = numbers("rotation", rotation)
     if not vertices.size:
         raise SceneError(f"{where} is a mesh without vertices", concerns="points")
-    shapes = {
-        "points": (vertices, (*vertices.shape[:1], 3)),
-        "position": (origin, (3,)),
-        "rotation": (turn, (3, 3)),
-    }
-    for argument, (values, shape) in shapes.items():
-        if values.shape != shape:
-            raise UsageError(
-                f"must have shape {shape}, got {values.shape}", argument=argument
-            )
+    _check_shape("points", vertices, (*vertices.shape[:1], 3))
+    _check_shape("position", origin, (3,))
+    _check_shape("rotation", turn, (3, 3))
     # False for nan, too.
     if not (np.abs([*vertices.ravel(), *origin]) <= MAX_COORDINATE_M).all():
-        raise SceneError(
-            f"{where}: points and position must be finite and at most {MAX_COORDINATE_M:g}",
-            concerns="points",
-        )
+        text = f"points and position must be finite and at most {MAX_COORDINATE_M:g}"
+        raise SceneError(f"{where}: {text}", concerns="points")
     if not is_rotation(turn):
-        raise SceneError(
-            f"{where}: its rotation is no rotation matrix: {turn.tolist()}"
-        )
+        text = f"its rotation is no rotation matrix: {turn.tolist()}"
+        raise SceneError(f"{where}: {text}")
     try:
         # Only the convex hull counts; a flat one has no interior and no depth.
         corners = hull_corners(vertices)
@@ -258,6 +238,12 @@ def make_mesh(
         position=(x, y, z),
         rotation=roll_pitch_yaw(turn),
     )
+
+
+def _check_shape(argument: str, values: Array, shape: tuple[int, ...]) -> None:
+    if values.shape != shape:
+        text = f"must have shape {shape}, got {values.shape}"
+        raise UsageError(text, argument=argument)
 
 
 def is_rotation(matrix: Array) -> bool:

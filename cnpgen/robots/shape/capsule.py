@@ -182,9 +182,8 @@ def _solved(
     linear = np.block([[-normals, zeros], [zeros, -normals]])
     # Unknowns: both ends (6), radius r and excess t. The facets' constraints are
     # linear.
-    facet_gradients = np.concatenate(
-        [linear, np.zeros((2 * facets, 1)), np.ones((2 * facets, 1))], axis=1
-    )
+    zero, one = np.zeros((2 * facets, 1)), np.ones((2 * facets, 1))
+    facet_gradients = np.concatenate([linear, zero, one], axis=1)
 
     def margins(x: Array) -> Array:
         # r - thickness - distance from the segment >= 0, with the gradient of the
@@ -194,18 +193,14 @@ def _solved(
 
     def gradients(x: Array) -> Array:
         _, away, where = _distances(corners, x[:3], x[3:6])
-        columns = (
-            (1 - where)[:, None] * away,
-            where[:, None] * away,
-            np.ones((len(away), 1)),
-            np.zeros((len(away), 1)),
-        )
-        return np.concatenate([np.concatenate(columns, axis=1), facet_gradients])
+        of_ends = (1 - where)[:, None] * away, where[:, None] * away
+        constants = np.ones((len(away), 1)), np.zeros((len(away), 1))
+        near = np.concatenate([*of_ends, *constants], axis=1)
+        return np.concatenate([near, facet_gradients])
 
-    start = np.concatenate(
-        [ends.ravel(), [(_distances(corners, *ends)[0] + thickness).max()]]
-    )
-    start = np.append(start, (ends @ normals.T - offsets).max())
+    radius = (_distances(corners, *ends)[0] + thickness).max()
+    excess = (ends @ normals.T - offsets).max()
+    start = np.append(ends.ravel(), [radius, excess])
     solved = minimize(
         lambda x: x[6] + x[7],
         start,
@@ -214,6 +209,5 @@ def _solved(
         method="SLSQP",
         options={"maxiter": 60, "ftol": 1e-7},
     )
-    return np.asarray(
-        solved.x[:6].reshape(2, 3) if np.isfinite(solved.x).all() else ends
-    )
+    is_finite = np.isfinite(solved.x).all()
+    return np.asarray(solved.x[:6].reshape(2, 3) if is_finite else ends)

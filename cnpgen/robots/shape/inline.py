@@ -61,14 +61,10 @@ def with_inline_meshes(
     except ValueError:
         # The reader of the robot raises the error.
         return urdf
-    elements = [
-        (link, element)
-        for link in tree.iter("link")
-        for element in link.findall("collision")
-    ]
     meshes = [
         (link, element, mesh)
-        for link, element in elements
+        for link in tree.iter("link")
+        for element in link.findall("collision")
         if (mesh := _mesh_file(element)) is not None
     ]
     errors = _unknown_links(tree, links)
@@ -76,33 +72,29 @@ def with_inline_meshes(
         parts = most if not links or link.get("name") in links else 1
         try:
             file = find_named_file(mesh.get("filename", ""), path, packages)
-            addresses = [
-                address_of(part)
-                for part in _parts_of_file(file, scale_of(mesh), parts, keep)
-            ]
+            hulls = _parts_of_file(file, scale_of(mesh), parts, keep)
+            addresses = [address_of(hull) for hull in hulls]
         except RecipeError as error:
             name = link.get("name", "")
-            errors += [
-                f"{text} (a mesh of link {name!r}; without it: skipped_meshes = [{name!r}] in [robot])"
-                for text in error.errors
-            ]
+            hint = f"a mesh of link {name!r}; without it: skipped_meshes = [{name!r}] in [robot]"
+            errors += [f"{text} ({hint})" for text in error.errors]
         else:
             mesh.attrib.pop("scale", None)
             _replace(link, element, mesh, addresses)
     if errors:
         raise RecipeError(list(dict.fromkeys(errors)))
-    unversioned = (
-        tree.find(".//collision/geometry/capsule") is not None
-        and tree.get("version", "1.0") < _CAPSULES
-    )
-    if unversioned:
-        # The URDF parser would ignore capsules, with warnings on stderr.
-        tree.set("version", _CAPSULES)
-    return (
-        ElementTree.tostring(tree, encoding="unicode")
-        if meshes or unversioned
-        else urdf
-    )
+    is_changed = _allow_capsules(tree) or meshes
+    return ElementTree.tostring(tree, encoding="unicode") if is_changed else urdf
+
+
+def _allow_capsules(tree: ElementTree.Element) -> bool:
+    """Set the version of a URDF with capsules, if it has an earlier one; return whether this was necessary."""
+    has_capsules = tree.find(".//collision/geometry/capsule") is not None
+    if not has_capsules or tree.get("version", "1.0") >= _CAPSULES:
+        return False
+    # The URDF parser would ignore capsules, with warnings on stderr.
+    tree.set("version", _CAPSULES)
+    return True
 
 
 def _unknown_links(robot: ElementTree.Element, links: Sequence[str]) -> list[str]:

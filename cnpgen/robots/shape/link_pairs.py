@@ -102,18 +102,11 @@ def find_pairs(
             _ends(capsules[link], rotations[joints[link]], positions[joints[link]])
             for link in (first, second)
         ]
-        near = (
-            segment_distances(*ends[0], *ends[1])
-            < capsules[first].radius + capsules[second].radius
-        )
-        is_always = hit.mean() > ALWAYS_FRACTION
-        left_out = (
-            "disabled"
-            if disabled and names in disabled
-            else "always"
-            if is_always
-            else ""
-        )
+        reach = capsules[first].radius + capsules[second].radius
+        near = segment_distances(*ends[0], *ends[1]) < reach
+        left_out = "always" if hit.mean() > ALWAYS_FRACTION else ""
+        if disabled and names in disabled:
+            left_out = "disabled"
         found.append(LinkPair.from_samples(first, second, left_out, hit, near))
     return tuple(found)
 

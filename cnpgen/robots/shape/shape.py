@@ -14,6 +14,7 @@ import numpy as np
 
 from cnpgen.arrays import Array
 from cnpgen.errors import RecipeError, nearest
+from cnpgen.machine.threads import one_thread
 from cnpgen.robots.chain import Chain, frame_of
 from cnpgen.robots.robot_spec import HeldObject
 from cnpgen.robots.shape.capsule import Capsule, covering_capsule, covers
@@ -42,6 +43,9 @@ Size = tuple[float, float, float]
 # Of the computation of capsules and pairs; cached results of another revision are
 # ignored.
 SHAPE_REVISION = 1
+# Entries of the package for the robots of shipped problems, so that their first use
+# computes nothing; ``tests/kernels/make_shipped_tapes.py`` writes them.
+SHIPPED = Path(__file__).with_name("shipped")
 HELD_OBJECT = "held object"  # takes the place of a link's name
 SAMPLED_HELD_STATES = 2000  # states in which the object and the links are compared
 
@@ -140,17 +144,21 @@ def _cached(
     convex_parts: Parts,
     compute: Callable[[], tuple[Capsules, Pairs]],
 ) -> tuple[Capsules, Pairs]:
-    """Return capsules, which must cover the parts, and pairs from a cache folder, or compute and store them.
+    """Return capsules, which must cover the parts, and pairs: shipped, from a cache folder, or computed and stored.
 
-    The JSON values determine the result. Without a folder, it is computed.
+    The JSON values determine the result.
     """
     name = f"shape-{hashlib.sha256(json.dumps([SHAPE_REVISION, *numbers]).encode()).hexdigest()[:32]}.json"
-    if keep is not None and (entry := read_entry(keep / name)) is not None:
-        with suppress(ValueError, KeyError, TypeError, RecursionError):
-            # The cache is not trusted: capsules must cover the parts, or they are
-            # computed again.
-            return _read(json.loads(entry), convex_parts)
-    capsules, pairs = compute()
+    for folder in (SHIPPED, keep):
+        if folder is not None and (entry := read_entry(folder / name)) is not None:
+            with suppress(ValueError, KeyError, TypeError, RecursionError):
+                # The cache is not trusted: capsules must cover the parts, or they are
+                # computed again.
+                return _read(json.loads(entry), convex_parts)
+    # Sums of matrix products, and so the last digits, would depend on the number of
+    # threads.
+    with one_thread():
+        capsules, pairs = compute()
     if keep is not None:
         write_entry(keep / name, json.dumps(_written(capsules, pairs)).encode())
     return capsules, pairs
@@ -234,28 +242,17 @@ def load_held_shape(
     """
     convex_parts, joints = place_convex_parts(urdf, model)
     if not joints:
-        raise RecipeError(
-            [
-                "no link has a <collision> element, so that contacts with the held object cannot be checked"
-            ]
-        )
+        text = "no link has a <collision> element, so that contacts with the held object cannot be checked"
+        raise RecipeError([text])
     for link in held.touch_links:
         if link not in joints:
-            raise RecipeError(
-                [
-                    f"object.touch_links: no link {link!r} has collision geometry{nearest(link, joints)}"
-                ]
-            )
+            text = f"no link {link!r} has collision geometry{nearest(link, joints)}"
+            raise RecipeError([f"object.touch_links: {text}"])
     tip = model.frames[tip_frame]
-    carrier = int(tip.parentJoint)
-    checked = [
-        link
-        for link in joints
-        if link not in held.touch_links and joints[link] != carrier
-    ]
-    box = _box(
-        held.size, np.array(tip.placement.rotation), np.array(tip.placement.translation)
-    )
+    carrier, pose = int(tip.parentJoint), tip.placement
+    moving = (link for link in joints if joints[link] != carrier)
+    checked = [link for link in moving if link not in held.touch_links]
+    box = _box(held.size, np.array(pose.rotation), np.array(pose.translation))
     parts = (*(part for part in convex_parts if part.link in checked), box)
     joints = {link: joints[link] for link in checked} | {HELD_OBJECT: carrier}
 
@@ -263,12 +260,8 @@ def load_held_shape(
         capsules = tuple(covering_capsule(_parts_of(link, parts)) for link in checked)
         return capsules, _compare(model, parts, capsules, joints)
 
-    about = [
-        HELD_OBJECT,
-        list(held.size),
-        list(held.touch_links),
-        tip.placement.homogeneous.tolist(),
-    ]
+    about = [HELD_OBJECT, list(held.size), list(held.touch_links)]
+    about.append(pose.homogeneous.tolist())
     capsules, pairs = _cached(keep, [urdf, *_joints_of(model), *about], parts, compute)
     if fixed := [pair.first for pair in pairs if pair.colliding > ALWAYS_FRACTION]:
         text = f"the held object overlaps {', '.join(fixed)} in nearly all of {SAMPLED_HELD_STATES:,} random states"

@@ -235,11 +235,7 @@ class Hdf5:
         dataset = self._open(name)
         if not isinstance(dataset, h5d.DatasetID):
             raise DatasetError(f"{self.path}: {name} must be a dataset of texts")
-        layout = dataset.get_create_plist()
-        if layout.get_layout() == h5d.VIRTUAL or layout.get_external_count():
-            raise DatasetError(
-                f"{self.path}: the texts of {name} are in another file, which is not read"
-            )
+        layout = self._layout(f"texts of {name}", dataset)
         if layout.get_nfilters():
             raise DatasetError(f"{self.path}: the texts of {name} must not be packed")
         _check_texts(self.path, name, dataset)
@@ -266,11 +262,7 @@ class Hdf5:
             raise DatasetError(
                 f"{self.path}: {name} must be a dataset, got a group or a type"
             )
-        layout = dataset.get_create_plist()
-        if layout.get_layout() == h5d.VIRTUAL or layout.get_external_count():
-            raise DatasetError(
-                f"{self.path}: the numbers of {name} are in another file, which is not read"
-            )
+        layout = self._layout(f"numbers of {name}", dataset)
         if dataset.get_type().get_class() not in {h5t.INTEGER, h5t.FLOAT}:
             raise DatasetError(
                 f"{self.path}: {name} must hold numbers, got {_type_text(dataset)}"
@@ -288,19 +280,22 @@ class Hdf5:
             raise DatasetError(
                 f"{self.path}: {name} must have at most {MAX_DIMENSIONS} dimensions, got {shape}"
             )
-        column = Column(
-            shape,
-            dataset.dtype,
-            dataset.get_offset(),
-            Attributes(self.path, dataset),
-            dataset,
-        )
-        self._check_size(
-            name,
-            column,
-            layout.get_chunk() if layout.get_layout() == h5d.CHUNKED else (),
-        )
+        attributes = Attributes(self.path, dataset)
+        column = Column(shape, dataset.dtype, dataset.get_offset(), attributes, dataset)
+        is_chunked = layout.get_layout() == h5d.CHUNKED
+        self._check_size(name, column, layout.get_chunk() if is_chunked else ())
         return column
+
+    def _layout(self, what: str, dataset: Any) -> Any:
+        """Return the creation properties of a dataset whose values are in this file."""
+        from h5py import h5d
+
+        layout = dataset.get_create_plist()
+        if layout.get_layout() == h5d.VIRTUAL or layout.get_external_count():
+            raise DatasetError(
+                f"{self.path}: the {what} are in another file, which is not read"
+            )
+        return layout
 
     def _check_size(self, name: str, column: Column, chunk: tuple[int, ...]) -> None:
         """Raise an error if this and all previous columns are larger than a file of this size can contain."""

@@ -11,6 +11,7 @@ from pathlib import Path
 
 from cnpgen.errors import UsageError
 from cnpgen.store.files.atomic import file_sha256, machine_errors, write_file
+from cnpgen.store.files.leftovers import remove_leftovers
 
 LIST = ".cnpgen-files"
 FORMAT = "cnpgen-files"
@@ -45,6 +46,8 @@ def claim_files(
             # Other files are in it.
             with suppress(OSError):
                 (folder / name).parent.rmdir()
+        for parent in {(folder / name).parent for name in planned}:
+            remove_leftovers(parent)
     # Before the first file is written: an interrupted call can be continued.
     _write_list(folder, dict.fromkeys(sorted(planned), ""))
 

@@ -1,6 +1,7 @@
 """Datasets at URLs: the rows are those of the folder, downloads continue, and damaged or missing files are refused."""
 
 import os
+import shutil
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -55,6 +56,35 @@ def test_a_dataset_in_memory_is_read_by_its_url(folder: Path) -> None:
             system.pipe(f"/bucket/hits/{path.relative_to(folder).as_posix()}", path.read_bytes())  # fmt: skip
     assert_has_all_rows(cnpgen.load_dataset("memory://bucket/hits/"))
     system.rm("/bucket", recursive=True)
+
+
+@pytest.mark.extended
+def test_a_dataset_in_s3_is_read_and_its_damaged_bytes_are_refused(
+    folder: Path, monkeypatch: pytest.MonkeyPatch, cache: Path
+) -> None:
+    """Needs ``pip install s3fs 'moto[server]'``: a store on this machine."""
+    s3fs, moto = pytest.importorskip("s3fs"), pytest.importorskip("moto.server")
+    server = moto.ThreadedMotoServer(ip_address="127.0.0.1", port=0)
+    server.start()
+    host, port = server.get_host_and_port()
+    monkeypatch.setenv("AWS_ENDPOINT_URL", f"http://{host}:{port}")
+    for name in ("AWS_ACCESS_KEY_ID", "AWS_SECRET_ACCESS_KEY"):
+        monkeypatch.setenv(name, "any")
+    monkeypatch.setenv("AWS_DEFAULT_REGION", "us-east-1")
+    try:
+        store = s3fs.S3FileSystem(skip_instance_cache=True)
+        store.mkdir("bucket")
+        store.put(str(folder), "bucket/hits", recursive=True)
+        assert_has_all_rows(cnpgen.load_dataset("s3://bucket/hits"))
+        shard = "bucket/hits/train/shard-00001.h5"
+        content = bytearray(store.cat_file(shard))
+        content[len(content) // 2] ^= 1
+        store.pipe_file(shard, bytes(content))
+        shutil.rmtree(cache)
+        with pytest.raises(DatasetError, match=r"shard-00001\.h5 is damaged"):
+            cnpgen.load_dataset("s3://bucket/hits")
+    finally:
+        server.stop()
 
 
 def test_a_second_call_reads_the_manifest_only(files: Files) -> None:

@@ -9,7 +9,7 @@ import pytest
 
 import cnpgen
 from cnpgen.addons.benchmark.run_suite import run_benchmark
-from cnpgen.addons.init import link_overlaps
+from cnpgen.addons.init import hull_gap, link_overlaps
 from cnpgen.addons.init.arm import read_arm
 from cnpgen.addons.init.initial_recipes import INITIAL_JERK_RATE, problem_of
 from cnpgen.addons.init.write import toml
@@ -20,7 +20,6 @@ from cnpgen.problems.constraints.joint import JointJerk
 from cnpgen.problems.load_robot import load_robot
 from cnpgen.problems.problem import resolved
 from cnpgen.problems.problem_file import load_problem
-from cnpgen.robots.shape import hull_gap
 from cnpgen.schema.keys import PerJoint, Range, keys
 from cnpgen.world.world import World
 from tests.examples.example_robots import folder as robots

@@ -8,14 +8,18 @@ import pytest
 
 from cnpgen.addons.manual.describe import (
     describe,
+    describe_model,
     describe_pipeline,
+    model_to_dict,
     numbers,
     quantity,
     recipe_to_dict,
 )
+from cnpgen.cli.main import main
 from cnpgen.cli.terminal import LINE_WIDTH, table
 from cnpgen.make.recipe import load_dataset_recipe
 from cnpgen.pipelines.pipeline import load_pipeline
+from cnpgen.planner.model_file import find_model, load_model
 from cnpgen.problems.problem_file import load_problem
 from cnpgen.schema.catalogue import list_recipes
 from cnpgen.schema.keys import Range
@@ -197,3 +201,17 @@ def test_a_table_can_cut_its_last_column_instead():
     (line,) = table([("name", "word " * 40)], one_line=True)
     assert len(line) <= LINE_WIDTH
     assert line.endswith(" ...")
+
+
+def test_recipes_and_models_say_that_goal_accelerations_are_free(capsys):
+    for name, given in (("airhockey-hit", "free"), ("panda-cup", "given")):
+        model = load_model(name)
+        assert model.goal_acceleration == given
+        assert f'goal_acceleration = "{given}"' in describe_model(model_to_dict(model))
+        text = describe_pipeline(load_pipeline(name))
+        assert ('goal_acceleration = "free"' in text) == (given == "free")
+    assert main(["show", "airhockey-hit"]) == 0
+    assert "model of airhockey: a network of 5 x 128" in capsys.readouterr().out
+    assert main(["show", str(find_model("airhockey-hit")), "--json"]) == 0
+    shown = json.loads(capsys.readouterr().out)
+    assert (shown["kind"], shown["goal_acceleration"]) == ("model", "free")

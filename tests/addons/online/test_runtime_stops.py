@@ -22,7 +22,7 @@ from cnpgen.refine.refine_plans import solve_plans
 from tests.conftest import some
 from tests.examples.example_robots import needs_robots
 from tests.faults.chunk_orders import run_chunk_orders
-from tests.faults.stop_orders import check_states, run_orders, valid_plans
+from tests.faults.stop_orders import check_states, run_orders, small_arm, valid_plans
 
 TARGET = [2.49, 0.0]  # m
 TICK_S = 1e-3
@@ -399,3 +399,15 @@ def test_the_motions_of_a_runtime_are_those_until_and_after_a_stop(planner, exec
     starts = [motion.start for motion in executing._timeline]
     assert starts == sorted(starts)
     assert [motion.end_time for motion in executing._timeline][-1] == executing.end_time
+
+
+def test_stops_of_stops_are_within_the_limits_between_samples():
+    checker, random = MotionChecker(), np.random.default_rng(51)
+    plans = small_arm().plans
+    limit = open_problem(plans[0].problem)[1].acceleration_limit
+    for number in range(240):
+        motion = sample_motion(plans[number % len(plans)], 0.0, step=4e-3)
+        for at in np.sort(random.uniform(0.15, 0.29, 2))[::-1].tolist():
+            motion = earliest_stop(checker, motion, at, measured=False)
+            times = np.arange(at, motion.end_time, 5e-5)
+            assert (np.abs(motion.at(times).ddq) <= 1.001 * limit).all()

@@ -203,6 +203,22 @@ def test_a_step_that_a_late_frame_explains_is_for_review(
     assert found["episodes"][0]["result"] == "EXCLUDE"  # by a stated jitter
 
 
+def test_a_fast_part_of_many_frames_is_for_review_with_nominal_times(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    q = np.zeros((180, 5))
+    # 6 rad/s for half a second: within the limit of 4.7 if every second frame is late.
+    q[:, 2] = 6.0 * np.clip(np.arange(180) / FPS - 2.0, 0, 0.5)
+    folder = write_lerobot(tmp_path / "set", [q])
+    code, found = check(capsys, folder, "--unit", "rad")
+    assert code == 0
+    (finding,) = [
+        each for each in found["episodes"][0]["findings"] if each["check"] == "velocity"
+    ]
+    assert finding["level"] == "REVIEW"
+    assert finding["joint"] == "elbow_flex"
+
+
 def test_actions_never_exclude_for_their_derivatives(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -10,6 +10,7 @@ from cnpgen.addons.trajectories.lower_bounds import (
     first_derivatives,
     second_derivatives,
     second_derivatives_with_velocities,
+    swing_velocities,
     third_derivatives,
 )
 
@@ -40,6 +41,7 @@ def test_bounds_are_never_above_the_derivatives_of_the_motion(
     q, dq = (wave(at, k) + noise * random.uniform(-1, 1, (len(t), 2)) for k in range(2))
     limit = 1 + 1e-9
     assert (largest(first_derivatives(t, q, noise, jitter)) <= RATES * limit).all()
+    assert (largest(swing_velocities(t, q, noise, jitter)) <= RATES * limit).all()
     assert (largest(second_derivatives(t, q, noise, jitter)) <= RATES**2 * limit).all()
     moved = noise + RATES.max() * jitter  # positions differ by at most V d
     assert (largest(third_derivatives(t, q, moved)) <= RATES**3 * limit).all()
@@ -71,6 +73,15 @@ def test_samples_whose_order_jitter_hides_bound_no_acceleration() -> None:
     short = next(iter(second_derivatives(t, q, 0.0, 1.1e-3)))
     assert np.isinf(short.low).all()
     assert np.isinf(short.high).all()
+
+
+def test_a_sample_aside_needs_the_velocity_of_the_way_to_it_and_back() -> None:
+    t, q = np.arange(9) / 30, np.zeros((9, 1))
+    q[4] = 0.4
+    # At least 0.4 rad to and fro within two spans and both jitters, with an error each.
+    least = 2 * (0.4 - 2e-2) / (2 / 30 + 1 / 30)
+    assert largest(swing_velocities(t, q, 1e-2, 1 / 60)) == pytest.approx(least)
+    assert largest(first_derivatives(t, q, 1e-2, 1 / 60)) < 0.76 * least
 
 
 def smallest_acceleration(t: np.ndarray, q: np.ndarray, noise: float) -> float:

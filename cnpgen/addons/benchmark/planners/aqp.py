@@ -260,7 +260,7 @@ class PlanePath:
         """Return the position at a length of the path [m], shape (2,)."""
         before, _ = self._lines()
         cut, radius, turn = self._arc()
-        one, other = _unit(self.bend - self.start), _unit(self.end - self.bend)
+        one, other = self._directions()
         if s <= before - cut:
             return np.asarray(self.start + s * one)
         along = s - (before - cut)
@@ -275,14 +275,16 @@ class PlanePath:
         )
 
     def _lines(self) -> tuple[float, float]:
-        return float(np.linalg.norm(self.bend - self.start)), float(
-            np.linalg.norm(self.end - self.bend)
-        )
+        before, after = self.bend - self.start, self.end - self.bend
+        return float(np.linalg.norm(before)), float(np.linalg.norm(after))
+
+    def _directions(self) -> tuple[Array, Array]:
+        return _unit(self.bend - self.start), _unit(self.end - self.bend)
 
     def _arc(self) -> tuple[float, float, float]:
         """Return the distance of the arc's ends from the bend [m], its radius [m] and its angle [rad]."""
         before, after = self._lines()
-        one, other = _unit(self.bend - self.start), _unit(self.end - self.bend)
+        one, other = self._directions()
         turn = float(np.arccos(np.clip(one @ other, -1, 1)))
         cut = min(before, after)
         if turn < MIN_BEND_RAD or cut == 0:

@@ -17,6 +17,7 @@ from cnpgen.addons.benchmark.benchmark_planner import (
     BenchmarkPlanner,
     Plan,
     Setting,
+    distinct_times,
     require_rigid_torque,
 )
 from cnpgen.addons.benchmark.planners.obstacle_boxes import require_table_or_transport
@@ -177,8 +178,7 @@ def add_boundary_conditions(program: Any, boundary: Boundary) -> None:
 
 def sampled(spline: Any) -> Trajectory:
     """Sample a cubic spline of Drake at its knots, between which quintics with accelerations equal it."""
-    t = np.unique(spline.basis().knots())
-    t = np.append(t[:-1][np.diff(t) > MIN_KNOT_DISTANCE_S], t[-1])
+    t = distinct_times(spline.basis().knots(), MIN_KNOT_DISTANCE_S)
     states = (spline, spline.MakeDerivative(1), spline.MakeDerivative(2))
     return Trajectory(
         t - t[0],

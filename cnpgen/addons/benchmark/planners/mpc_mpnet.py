@@ -20,7 +20,7 @@ from cnpgen.addons.benchmark.benchmark_planner import (
     Setting,
     require_rigid_torque,
 )
-from cnpgen.addons.benchmark.planners.sst import Tree, radii_of
+from cnpgen.addons.benchmark.planners.sst import Tree, tree_of
 from cnpgen.addons.benchmark.planners.state_check import StateCheck
 from cnpgen.addons.paper.proposals import Proposals, load_proposals, shipped_proposals
 from cnpgen.arrays import Array
@@ -73,18 +73,7 @@ class MPCMPNet(BenchmarkPlanner):
             )
 
         def plan(task: Plans) -> Answer:
-            boundary = task.boundary
-            start_xyz, goal_xyz = (
-                task.columns["start_xyz"][0],
-                task.columns["goal_xyz"][0],
-            )
-            start = np.concatenate([boundary.start_q[0], boundary.start_dq[0]])
-            tree = Tree(
-                start,
-                start_xyz,
-                radii_of(problem, self.witness_radius),
-                STEERING_STEP_S,
-            )
+            tree = tree_of(problem, task, self.witness_radius, STEERING_STEP_S)
             steer = Steering(
                 self,
                 check,
@@ -92,10 +81,10 @@ class MPCMPNet(BenchmarkPlanner):
                 spread_of(problem),
                 setting.random(task),
             )
-            extend = ProposedExtension(tree, network, steer, boundary.goal_q[0])
+            extend = ProposedExtension(tree, network, steer, task.boundary.goal_q[0])
             return tree.grow(
                 extend,
-                goal_xyz,
+                task.columns["goal_xyz"][0],
                 time_limit=setting.time_limit,
                 max_iterations=MAX_PROPOSALS,
             )

@@ -9,7 +9,12 @@ from typing import Any
 
 import numpy as np
 
-from cnpgen.addons.benchmark.benchmark_planner import BenchmarkPlanner, Plan, Setting
+from cnpgen.addons.benchmark.benchmark_planner import (
+    BenchmarkPlanner,
+    Plan,
+    Setting,
+    distinct_times,
+)
 from cnpgen.addons.trajectories.sampled_trajectory import Trajectory
 from cnpgen.arrays import Array
 from cnpgen.errors import requires_extra
@@ -84,5 +89,5 @@ def _knots(motion: Any) -> Array:
             profile.brake.duration + np.concatenate([[0.0], np.cumsum(profile.t)])
         )
         times.append(np.cumsum(profile.brake.t))
-    t = np.unique(np.clip(np.concatenate(times), 0.0, motion.duration))
-    return np.append(t[:-1][np.diff(t) > MIN_SPAN_S], motion.duration)
+    t = np.clip(np.concatenate(times), 0.0, motion.duration)
+    return distinct_times(t, MIN_SPAN_S)

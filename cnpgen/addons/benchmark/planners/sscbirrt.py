@@ -11,7 +11,12 @@ from typing import Any
 
 import numpy as np
 
-from cnpgen.addons.benchmark.benchmark_planner import BenchmarkPlanner, Plan, Setting
+from cnpgen.addons.benchmark.benchmark_planner import (
+    BenchmarkPlanner,
+    Plan,
+    Setting,
+    distinct_times,
+)
 from cnpgen.addons.benchmark.planners.cbirrt import (
     MANIFOLD_TOLERANCE,
     MAX_PROJECTIONS,
@@ -125,8 +130,8 @@ def sampled(motion: Any) -> Trajectory | None:
         for ramp in piece.ramps:
             ends = np.cumsum([span for span, _ in ramp.pieces])
             times.append(start + ends)
-    t = np.unique(np.append(np.concatenate(times), motion.duration))
-    t = np.append(t[:-1][np.diff(t) > MIN_BREAK_DISTANCE_S], t[-1])
+    times.append(np.array([motion.duration]))
+    t = distinct_times(np.concatenate(times), MIN_BREAK_DISTANCE_S)
     if len(t) < 2:
         return None
     q, dq, _ = motion.evaluate(t)

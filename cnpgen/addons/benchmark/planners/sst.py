@@ -167,6 +167,13 @@ class Tree:
         return self.path_to(best) if best else None
 
 
+def tree_of(problem: Problem, task: Plans, witness_radius: float, step: float) -> Tree:
+    """Return the tree of a boundary problem with its root, the start; see ``radii_of``."""
+    boundary, tip = task.boundary, task.columns["start_xyz"][0]
+    start = np.concatenate([boundary.start_q[0], boundary.start_dq[0]])
+    return Tree(start, tip, radii_of(problem, witness_radius), step)
+
+
 class _GrowingArray:
     """Array to which rows are appended."""
 
@@ -209,23 +216,11 @@ class SST(BenchmarkPlanner):
         """Load the kernel that checks states."""
         problem, robot = open_problem(setting.problem)
         require_rigid_torque("sst", problem, robot)
-        radii, check = (
-            radii_of(problem, self.witness_radius),
-            StateCheck(problem, robot),
-        )
+        check = StateCheck(problem, robot)
 
         def plan(task: Plans) -> Answer:
-            boundary = task.boundary
-            start_xyz, goal_xyz = (
-                task.columns["start_xyz"][0],
-                task.columns["goal_xyz"][0],
-            )
-            tree = Tree(
-                np.concatenate([boundary.start_q[0], boundary.start_dq[0]]),
-                start_xyz,
-                radii,
-                CONTROL_STEP_S,
-            )
+            tree = tree_of(problem, task, self.witness_radius, CONTROL_STEP_S)
+            goal_xyz = task.columns["goal_xyz"][0]
             extend = partial(
                 self.extend,
                 tree,

@@ -182,6 +182,11 @@ class TrajOptTranscription:
             np.concatenate([*high, acceleration, [np.inf]]),
         )
 
+    def _inner(self, x: Array) -> tuple[Array, Array, Array]:
+        """Return positions, velocities and accelerations at the inner knots."""
+        q, dq, ddq, _ = self.unpack(x)
+        return q[1:-1], dq[1:-1], ddq[1:-1]
+
     def defects(self, x: Array) -> Array:
         """Return the defects of explicit Euler steps between knots, shape (2 (KNOTS - 1) n,)."""
         q, dq, ddq, duration = self.unpack(x)
@@ -215,14 +220,12 @@ class TrajOptTranscription:
 
     def margins(self, x: Array) -> Array:
         """Return the constraints at the inner knots, nonnegative if satisfied."""
-        q, dq, ddq, _ = self.unpack(x)
-        return np.asarray(self._at_knots(q[1:-1], dq[1:-1], ddq[1:-1])[0].ravel())
+        return np.asarray(self._at_knots(*self._inner(x))[0].ravel())
 
     def margins_jacobian(self, x: Array) -> Array:
         """Return the derivative of ``margins``."""
         n, inner = self._robot.n, KNOTS - 2
-        q, dq, ddq, _ = self.unpack(x)
-        g, derivatives = self._at_knots(q[1:-1], dq[1:-1], ddq[1:-1])
+        g, derivatives = self._at_knots(*self._inner(x))
         rows = g.shape[1]
         J = np.zeros((inner, rows, self._size))
         # If accelerations at both ends are free, too, those of inner knots follow the
@@ -282,35 +285,11 @@ def _with_object(robot: Robot, size: Array, boxes: list[Box]) -> KnotConstraints
     """
     import pinocchio as pin
 
-    tip, model, data, limit = (
-        Tip(robot),
-        robot.model,
-        robot.model.createData(),
-        robot.torque_limit,
-    )
-
-    def object_values(q: Array) -> tuple[list[float], Array]:
-        position, rotation, J = tip.at(q)
-        turning = J[3:]
-        # With dR/dt = w x R, the gradient of R_22 has the z components of w_j x (R
-        # e_z).
-        values, gradients = (
-            [rotation[2, 2] - 1.0],
-            [np.cross(turning.T, rotation[:, 2])[:, 2]],
-        )
-        for box in boxes:
-            separation, normal = distance(position, box)
-            values.append(min(separation - MIN_CENTER_DISTANCE_M, 0.0))
-            gradients.append(normal @ J[:3] * (separation < MIN_CENTER_DISTANCE_M))
-            for corner in (CUBE * size) @ rotation.T:
-                penetration, normal = depth(position + corner, box)
-                values.append(-penetration)
-                # A corner at r from the tip moves with v + w x r.
-                gradients.append(-normal @ (J[:3] + np.cross(turning.T, corner).T))
-        return values, np.array(gradients)
+    model, data, limit = robot.model, robot.model.createData(), robot.torque_limit
+    tip = Tip(robot)
 
     def knot(q: Array, dq: Array, ddq: Array) -> tuple[Array, Array, Array, Array]:
-        values, gradient = object_values(q)
+        values, gradient = _object_values(tip, q, size, boxes)
         pin.computeRNEADerivatives(model, data, q, dq, ddq)
         # Pinocchio fills the upper half of the symmetric M only.
         inertia, torque = np.triu(data.M) + np.triu(data.M, 1).T, np.array(data.tau)
@@ -332,3 +311,24 @@ def _with_object(robot: Robot, size: Array, boxes: list[Box]) -> KnotConstraints
         return g, (a, b, c)
 
     return at
+
+
+def _object_values(
+    tip: Tip, q: Array, size: Array, boxes: list[Box]
+) -> tuple[list[float], Array]:
+    """Return the values of the constraints of the object at q [rad], and their gradients, shape (m, n)."""
+    position, rotation, J = tip.at(q)
+    turning = J[3:]
+    # With dR/dt = w x R, the gradient of R_22 has the z components of w_j x (R e_z).
+    values = [rotation[2, 2] - 1.0]
+    gradients = [np.cross(turning.T, rotation[:, 2])[:, 2]]
+    for box in boxes:
+        separation, normal = distance(position, box)
+        values.append(min(separation - MIN_CENTER_DISTANCE_M, 0.0))
+        gradients.append(normal @ J[:3] * (separation < MIN_CENTER_DISTANCE_M))
+        for corner in (CUBE * size) @ rotation.T:
+            penetration, normal = depth(position + corner, box)
+            values.append(-penetration)
+            # A corner at r from the tip moves with v + w x r.
+            gradients.append(-normal @ (J[:3] + np.cross(turning.T, corner).T))
+    return values, np.array(gradients)

@@ -37,17 +37,24 @@ static double time_of(const double *coefficients, double offset, double width) {
   return sum * width;
 }
 
-/* Fill the table of times at the edges of the cells, from which states at a time are found. */
+/* Fill the table of times at the edges of the cells, from which states at a time are found. All nodes are divided
+together: a division of vectors takes as long as one of numbers. */
 static void fill_times(NAME_motion *motion) {
-  double coefficients[DEGREE + 1], time = 0;
-  int last = -1;
+  double coefficients[DEGREE + 1], part[CELLS * NODES], time = 0;
+  for (int cell = 0, last = -1; cell < CELLS; cell++) {
+    if (cell_span[cell] != last) rate_coefficients(motion->rate, cell_span[cell], coefficients);
+    last = cell_span[cell];
+    double r[NODES] = {0};
+    for (int k = DEGREE; k >= 0; k--)
+      for (int i = 0; i < NODES; i++) r[i] = r[i] * node_offset[cell * NODES + i] + coefficients[k];
+    for (int i = 0; i < NODES; i++) part[cell * NODES + i] = r[i];
+  }
+  for (int i = 0; i < CELLS * NODES; i++) part[i] = node_width[i] / part[i];
   motion->time[0] = 0;
   for (int cell = 0; cell < CELLS; cell++) {
-    int span = cell_span[cell];
-    if (span != last) rate_coefficients(motion->rate, span, coefficients);
-    last = span;
-    double low = cell_edge[cell], width = cell_edge[cell + 1] - low;
-    time += time_of(coefficients, low - (double)span / RATE_SPANS, width);
+    double sum = 0; /* of a cell alone: sums of cells do not wait for each other */
+    for (int i = 0; i < NODES; i++) sum += part[cell * NODES + i];
+    time += sum;
     motion->time[cell + 1] = time;
   }
   motion->duration = time;

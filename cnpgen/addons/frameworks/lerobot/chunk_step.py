@@ -43,7 +43,6 @@ PLACE = (
 )
 
 
-@ProcessorStepRegistry.register("cnpgen_chunks")
 class ChunkStep(ProcessorStep):  # type: ignore[misc] # LeRobot has no types
     """A step for both processors of a policy: it notes observations, and executes chunks.
 
@@ -213,6 +212,11 @@ class ChunkStep(ProcessorStep):  # type: ignore[misc] # LeRobot has no types
 
     def _radians(self, values: Array) -> Array:
         return np.asarray(self._zero + self._factor * values)
+
+
+# Registered after its definition: as a decorator, a stand-in for LeRobot would replace
+# the class on the documentation site.
+ProcessorStepRegistry.register("cnpgen_chunks")(ChunkStep)
 
 
 @dataclass(frozen=True, eq=False)

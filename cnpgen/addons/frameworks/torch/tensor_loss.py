@@ -100,19 +100,12 @@ class TensorLoss:
         Raises:
             UsageError: A shape is wrong, or a tensor is not real.
         """
-        given = {
-            "path": path,
-            "rate": rate,
-            "weights": self.loss.ordered_weights(weights),
-        }
-        given |= {"obstacle_poses": obstacle_poses, "start_tip": start_tip}
-        tensors = {
-            name: real_tensor(name, values)
-            for name, values in given.items()
-            if values is not None
-        }
-        self.loss.check_shapes(
-            **{name: tuple(tensor.shape) for name, tensor in tensors.items()}
+        tensors = self._checked(
+            path=path,
+            rate=rate,
+            weights=self.loss.ordered_weights(weights),
+            obstacle_poses=obstacle_poses,
+            start_tip=start_tip,
         )
         kind = {
             "device": tensors["path"].device,
@@ -133,6 +126,18 @@ class TensorLoss:
         tightening = torch.tensor(self.loss.tightening, **kind)
         arguments = (poses, relaxation, *self._table(shift, kind), tightening, weights)
         return self._evaluate(path, rate, arguments)
+
+    def _checked(self, **arguments: Any) -> dict[str, torch.Tensor]:
+        """Return the arguments that are not None as tensors with the right shapes."""
+        tensors = {
+            name: real_tensor(name, values)
+            for name, values in arguments.items()
+            if values is not None
+        }
+        self.loss.check_shapes(
+            **{name: tuple(tensor.shape) for name, tensor in tensors.items()}
+        )
+        return tensors
 
     def _evaluate(
         self,

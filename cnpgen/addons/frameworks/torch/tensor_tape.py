@@ -120,14 +120,10 @@ class TensorTape:
                 self._inputs.append((k, int(tape.a[k]), int(tape.b[k])))
             else:
                 # Values without a later use free their memory at once.
-                dead = tuple(
-                    operand for operand in set(operands[k]) if last[operand] == k
-                )
-                apply = (
-                    _guarded_quotient
-                    if _divides_by_guarded(tape, k)
-                    else _APPLY[names[k]]
-                )
+                uses = set(operands[k])
+                dead = tuple(operand for operand in uses if last[operand] == k)
+                guarded = _divides_by_guarded(tape, k)
+                apply = _guarded_quotient if guarded else _APPLY[names[k]]
                 self._steps.append((k, apply, operands[k], dead))
 
     def __len__(self) -> int:

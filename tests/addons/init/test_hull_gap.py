@@ -5,10 +5,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from cnpgen.addons.init import hull_gap
+from cnpgen.addons.init.hull_gap import HullGap, measure_hull_gap
 from cnpgen.problems.load_robot import load_robot
 from cnpgen.problems.problem import Problem
-from cnpgen.robots.shape import hull_gap, link_pairs
-from cnpgen.robots.shape.hull_gap import HullGap, measure_hull_gap
+from cnpgen.robots.shape import link_pairs
 from cnpgen.robots.urdf import read_urdf
 from cnpgen.world.world import World
 from tests.examples.meshes import Meshes

@@ -97,19 +97,16 @@ def measure_hull_gap(
     """
     poses = sample_poses(model, GAP_STATES)
     parts = LinkContact(poses, map(body_of_part, shape.convex_parts), shape.joints)
-    meshes = LinkContact(
-        poses, _reference_bodies(urdf, path, packages, model), shape.joints
-    )
+    bodies = _reference_bodies(urdf, path, packages, model)
+    meshes = LinkContact(poses, bodies, shape.joints)
     overlaps = {}
     # Pairs that always touch are left out by the judge; their meshes show whether they
     # should be.
     for pair in shape.pairs:
         if pair.left_out in ("", "always"):
-            of_parts = parts.of(pair.first, pair.second)
-            overlaps[pair] = (
-                of_parts,
-                meshes.of(pair.first, pair.second, among=of_parts),
-            )
+            names = pair.first, pair.second
+            of_parts = parts.of(*names)
+            overlaps[pair] = of_parts, meshes.of(*names, among=of_parts)
     checked = [overlap for pair, overlap in overlaps.items() if not pair.left_out]
     free, accepted = np.ones(GAP_STATES, bool), np.ones(GAP_STATES, bool)
     # Over all pairs: free by the meshes, accepted by the convex parts.
@@ -123,19 +120,14 @@ def measure_hull_gap(
         (pair, PairGap(pair.first, pair.second, float(part.mean()), float(mesh.mean()), rejected[pair]))
         for pair, (part, mesh) in overlaps.items()
     ]  # fmt: skip
+    judged = [gap for pair, gap in gaps if not pair.left_out]
+    left_out = (gap for pair, gap in gaps if pair.left_out)
     return HullGap(
         free=int(free.sum()),
         rejected=int((free & ~accepted).sum()),
         accepted=int(accepted.sum()),
-        pairs=tuple(
-            sorted(
-                (gap for pair, gap in gaps if not pair.left_out),
-                key=lambda gap: -gap.rejected,
-            )
-        ),
-        hidden=tuple(
-            gap for pair, gap in gaps if pair.left_out and gap.meshes <= ALWAYS_FRACTION
-        ),
+        pairs=tuple(sorted(judged, key=lambda gap: -gap.rejected)),
+        hidden=tuple(gap for gap in left_out if gap.meshes <= ALWAYS_FRACTION),
     )
 
 

@@ -49,6 +49,28 @@ def obstacles_of_points(
     Raises:
         UsageError: A point is not finite, or an argument is out of its range.
     """
+    cloud = _checked_cloud(points)
+    check_range("radius", number("radius", radius), 1e-6, MAX_POINT_SIZE_M, "m")
+    size = number("resolution", resolution)
+    check_range("resolution", size, MIN_VOXEL_M, MAX_POINT_SIZE_M, "m")
+    least = integer("max_obstacles", max_obstacles, least=1)
+    # The grid of extent / edge voxels per axis has at most MAX_GRID_VOXELS: edge^3 >=
+    # volume / maximum.
+    volume = np.prod(np.ptp(cloud, axis=0) + resolution)
+    edge = max(resolution, float((volume / MAX_GRID_VOXELS) ** (1 / 3)))
+    # The number of boxes is only known once they are built.
+    boxes = _boxes(cloud, edge)
+    while len(boxes) > least:
+        edge *= VOXEL_GROWTH
+        boxes = _boxes(cloud, edge)
+    return tuple(
+        _obstacle(f"{name} {index}", low, high, radius)
+        for index, (low, high) in enumerate(boxes, 1)
+    )
+
+
+def _checked_cloud(points: ArrayLike) -> Array:
+    """Return points as an array of shape (N, 3); raise UsageError for another shape or values that are not plausible."""
     cloud = numbers("points", points)
     if cloud.ndim != 2 or cloud.shape[1] != 3 or not len(cloud):
         raise UsageError(
@@ -66,32 +88,7 @@ def obstacles_of_points(
         hint = suggested_unit(float(np.abs(cloud[row]).max()), "m", high=limit)
         text = f"must be finite and at most {limit:g} m, got {cloud[row]} in point {row}{hint}"
         raise UsageError(text, argument="points")
-    check_range("radius", number("radius", radius), 1e-6, MAX_POINT_SIZE_M, "m")
-    check_range(
-        "resolution",
-        number("resolution", resolution),
-        MIN_VOXEL_M,
-        MAX_POINT_SIZE_M,
-        "m",
-    )
-    least = integer("max_obstacles", max_obstacles, least=1)
-    # The grid of extent / edge voxels per axis has at most MAX_GRID_VOXELS: edge^3 >=
-    # volume / maximum.
-    edge = max(
-        resolution,
-        float(
-            (np.prod(np.ptp(cloud, axis=0) + resolution) / MAX_GRID_VOXELS) ** (1 / 3)
-        ),
-    )
-    # The number of boxes is only known once they are built.
-    boxes = _boxes(cloud, edge)
-    while len(boxes) > least:
-        edge *= VOXEL_GROWTH
-        boxes = _boxes(cloud, edge)
-    return tuple(
-        _obstacle(f"{name} {index}", low, high, radius)
-        for index, (low, high) in enumerate(boxes, 1)
-    )
+    return cloud
 
 
 def _obstacle(name: str, low: Array, high: Array, radius: float) -> Obstacle:
