@@ -163,8 +163,8 @@ JSON_CHANGES: list[tuple[str, Any, Callable[[Any], Any], str]] = [
     ("a position", STATES, lambda m: m[4].pop("position"), "refused"),
     ("names", STATES, lambda m: [s.update(name=BACKWARDS) for s in m], "changed"),
     ("a second", STATES, lambda m: m[4]["header"]["stamp"].update(sec=10), "refused"),
-    ("unit", COLUMNS, lambda m: m.update(unit="deg"), "listed"),
-    ("joint_names", COLUMNS, lambda m: rename(m, "joint_names", "joints"), "listed"),
+    ("unit", COLUMNS, lambda m: m.update(unit="deg"), "refused"),
+    ("joint_names", COLUMNS, lambda m: rename(m, "joint_names", "joints"), "refused"),
     ("an object", COLUMNS, lambda m: m.update(limits={"a": 1}), "refused"),
 ]
 
