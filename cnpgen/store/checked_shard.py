@@ -31,7 +31,7 @@ from cnpgen.store.shard import (
 )
 
 SAMPLE_ID, PARAMETERS = "sample_id", "parameters"
-RANGE_ROUNDING = 1e-6  # relative
+STORED_ROUNDING = 1e-6  # relative
 
 
 @dataclass(frozen=True, eq=False)
@@ -206,7 +206,7 @@ def _range_problem(spec: DatasetSpec, columns: Mapping[str, NDArray[Any]]) -> st
     rows, field = columns[PARAMETERS], fields[PARAMETERS]
     low, high = np.array(field.valid_min), np.array(field.valid_max)
     # Ends of a range may be rounded to float32.
-    slack = RANGE_ROUNDING * np.maximum(np.abs(low), np.abs(high))
+    slack = STORED_ROUNDING * np.maximum(np.abs(low), np.abs(high))
     outside = (rows < low - slack) | (rows > high + slack)
     if not outside.any():
         return ""

@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from cnpgen.addons.trajectories.array_tables import JOINT_NAMES, UNIT_ATTRIBUTES
 from cnpgen.addons.trajectories.bag_tables import has_bags
 from cnpgen.addons.trajectories.load_options import LoadOptions
 from cnpgen.addons.trajectories.sampled_trajectory import Trajectory
@@ -36,7 +37,7 @@ from cnpgen.robots.robot import Robot
 from cnpgen.schema.argument_types import checked_arguments
 from cnpgen.schema.old_keywords import with_old_keywords
 from cnpgen.store.dataset_spec import StoredProblem
-from cnpgen.store.files.accounted import check_allowed, unmatched
+from cnpgen.store.files.accounted import MISSPELT, check_allowed, unmatched
 
 # Elements beside columns that say what their numbers mean, and attributes of HDF5 that do.
 _OF_NAMES = "joint_name", "joints", "names", "unit", "units"
@@ -183,7 +184,8 @@ def _check_meaning(
     for name in ignored:
         key, is_attribute = _key_of(name), name.startswith("attribute ")
         known = {*_OF_NAMES, *_OF_NUMBERS} if is_attribute else _OF_NAMES
-        if key in known and key not in allowed:
+        similar = nearest(key, (JOINT_NAMES, *UNIT_ATTRIBUTES), similarity=MISSPELT)
+        if (key in known or similar) and key not in allowed:
             text = (
                 f"{path}: {name!r} is not used and may change the meaning of columns:"
             )

@@ -111,7 +111,13 @@ class Account:
 
 
 def unmatched(keys: Sequence[str], paths: Sequence[str]) -> list[str]:
-    """Return the keys that name none of some elements."""
+    """Return the keys that name none of some elements.
+
+    Raises:
+        UsageError: A key is no text.
+    """
+    if wrong := [key for key in keys if not isinstance(key, str)]:
+        raise UsageError(f"must be names, got {wrong[0]!r:.60}", argument=ALLOW_UNUSED)
     return [key for key in keys if not any(_matches(path, [key]) for path in paths)]
 
 

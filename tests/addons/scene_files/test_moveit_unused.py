@@ -199,18 +199,18 @@ def pairs_of(count: int, *, seed: int) -> Iterator[list[tuple[Place, Any]]]:
 def test_one_of_two_changes_does_not_hide_the_other(root: str, count: int) -> None:
     content = document() if root == "rich" else minimal()
     usual = digest(read(content)[0])
-    fates, lost = set(), []
+    results, lost = set(), []
     for (first, one), (second, other) in pairs_of(count, seed=4):
         alone = [
             outcome(content, first, one, usual),
             outcome(content, second, other, usual),
         ]
         both = outcome(changed(content, first, one), second, other, usual)
-        fates.add(both)
+        results.add(both)
         # Two wrong elements may be right together, in a part that is listed.
         if {"used", "refused"} & {*alone} and both in {"lost", "without effect"}:
             lost.append(f"{plain(first)} = {one!r}, {plain(second)} = {other!r}")
-    assert fates >= ({"refused"} if root == "plain" else {"used", "refused"})
+    assert results >= ({"refused"} if root == "plain" else {"used", "refused"})
     assert not lost
 
 
