@@ -131,12 +131,7 @@ def check_allowed(
         unused: Paths of the unused elements of all documents.
         known: Keys of the documents, for suggestions.
     """
-    for key in keys:
-        if not isinstance(key, str):
-            raise UsageError(f"must hold names, got {key!r}", argument=ALLOW_UNUSED)
     for key in unmatched(keys, unused):
-        if not isinstance(key, str):
-            raise UsageError(f"must be names, got {key!r}", argument=ALLOW_UNUSED)
         names = sorted({*known, *unused})
         hint = " that is refused" if key in names else nearest(key, names)
         raise UsageError(
