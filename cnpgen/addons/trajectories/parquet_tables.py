@@ -92,12 +92,7 @@ def read_parquet(path: Path) -> Any:
     content = read_file(path, max_bytes=MAX_TABLE_BYTES)
     try:
         file = pyarrow.parquet.ParquetFile(pyarrow.BufferReader(content))
-        groups = [file.metadata.row_group(i) for i in range(file.num_row_groups)]
-        parts = [group.column(i) for group in groups for i in range(group.num_columns)]
-        # Values that repeat take no space in the file, so values are counted.
-        size = sum(part.num_values for part in parts)
-        size = max(size, file.metadata.num_rows * file.metadata.num_columns)
-        n_bytes = sum(part.total_uncompressed_size for part in parts)
+        size, n_bytes = _unpacked_size(file)
         if size <= MAX_PARQUET_VALUES and n_bytes <= MAX_UNPACKED_BYTES:
             return _parquet_table(pyarrow, content, file.schema)
     except (
@@ -113,6 +108,24 @@ def read_parquet(path: Path) -> Any:
         f"{path} holds {size:,} values in {n_bytes:,} bytes, expected at most"
         f" {MAX_PARQUET_VALUES:,} in {MAX_UNPACKED_BYTES:,}"
     )
+
+
+def _unpacked_size(file: Any) -> tuple[int, int]:
+    """Return the numbers of values and of bytes of all columns when they are unpacked."""
+    metadata = file.metadata
+    groups = [metadata.row_group(i) for i in range(metadata.num_row_groups)]
+    size = metadata.num_rows * metadata.num_columns
+    n_bytes = sum(group.total_byte_size for group in groups)
+    if size > MAX_PARQUET_VALUES or n_bytes > MAX_UNPACKED_BYTES:
+        return size, n_bytes
+    # A reader raises errors for damaged properties of columns; pyarrow's access to these
+    # properties would end the process instead.
+    for i in range(len(groups)):
+        next(file.iter_batches(batch_size=1, row_groups=[i]), None)
+    parts = [group.column(i) for group in groups for i in range(group.num_columns)]
+    # Values that repeat take no space in the file, so values are counted.
+    size = max(size, sum(part.num_values for part in parts))
+    return size, max(n_bytes, sum(part.total_uncompressed_size for part in parts))
 
 
 def _parquet_table(pyarrow: Any, content: bytes, schema: Any) -> Any:

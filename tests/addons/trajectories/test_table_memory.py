@@ -1,5 +1,7 @@
 """Tables that take much more memory than their files: decoded sizes are counted before they are read."""
 
+import subprocess
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -93,3 +95,29 @@ def test_lists_and_objects_of_json_are_counted_before_they_are_read(
     path.write_text("[" + "[]," * 2_000_000 + "0]", encoding="utf-8")
     with pytest.raises(UsageError, match="2,000,001 lists and objects, expected at"):
         read_trajectory_tables(path)
+
+
+# Reads files with a changed bit in each byte of the footer; a crash would end the process.
+READ_CHANGED = """
+import sys
+from pathlib import Path
+from cnpgen.addons.trajectories.parquet_tables import read_parquet
+from cnpgen.errors import UsageError
+
+good = Path(sys.argv[1])
+content, changed, refused = good.read_bytes(), good.with_name("b.parquet"), 0
+footer = int.from_bytes(content[-8:-4], "little")
+for i in range(len(content) - 8 - footer, len(content) - 8):
+    changed.write_bytes(content[:i] + bytes([content[i] ^ 1]) + content[i + 1 :])
+    try:
+        read_parquet(changed)
+    except UsageError:
+        refused += 1
+assert refused > footer // 4
+"""
+
+
+def test_damaged_footers_of_parquet_do_not_end_the_process(tmp_path: Path) -> None:
+    path = write_parquet(tmp_path / "a.parquet", t=np.arange(3.0), q=[[0.0, 1.0]] * 3)
+    words = [sys.executable, "-c", READ_CHANGED, str(path)]
+    subprocess.run(words, check=True, capture_output=True)
