@@ -34,6 +34,8 @@ from cnpgen.errors import CnpgenError, UsageError
 if TYPE_CHECKING:
     from cnpgen.addons.benchmark.run_suite import Benchmark
 
+REPORT = "report.html"
+
 
 def add_options(parser: Parser) -> None:
     option = parser.add_argument
@@ -144,7 +146,10 @@ def _add_comparison(parser: Parser) -> None:
         action="store_true",
         help="discard earlier answers of these planners in DIR",
     )
-    text = "delete results of another suite, version, time limit, seed or planner parameters in DIR"
+    text = (
+        "delete results of another suite, version, time limit, seed or planner parameters"
+        " in DIR, and replace files that are no results"
+    )
     option("--force", action="store_true", help=text)
 
 
@@ -178,14 +183,33 @@ def run(arguments: argparse.Namespace) -> None:
         names = ("plant", "environment", "video")
         refuse(arguments, names, "{} needs --simulate")
     folder = arguments.out or Path(f"{Path(arguments.suite).stem}-results")
+    if not arguments.force:
+        _refuse_others(folder)
     found = _run(arguments, folder)
     save_benchmark_tables(found, folder)
     save_benchmark_figures(found, folder)
-    report = save_benchmark_report(found, folder / "report.html", video=arguments.video)
+    report = save_benchmark_report(found, folder / REPORT, video=arguments.video)
     print(
         json.dumps(_facts(found, folder), indent=2) if arguments.json else _text(found)
     )
     print(f"report: {report}", file=sys.stderr)
+
+
+def _refuse_others(folder: Path) -> None:
+    """Raise UsageError if the reports would replace files in a folder without results."""
+    from cnpgen.addons.benchmark.result_tables import TABLE_FILES
+    from cnpgen.addons.benchmark.run_record import RUNS_FILE
+
+    if (folder / RUNS_FILE).exists():
+        return
+    patterns = *TABLE_FILES, REPORT, "success-*.pdf", "distributions-*.pdf"
+    others = [path.name for pattern in patterns for path in folder.glob(pattern)]
+    if others:
+        raise UsageError(
+            f"{folder} has no results of a benchmark, but {', '.join(others)}, which"
+            " would be replaced: choose another folder, or pass {force}",
+            remedies={"force": True},
+        )
 
 
 def _run(arguments: argparse.Namespace, folder: Path) -> "Benchmark":

@@ -69,6 +69,21 @@ def test_a_short_benchmark_of_all_planners(
     assert "(paper: 92.59 %)" in out
 
 
+@pytest.mark.parametrize(
+    "name", ["results.csv", "tables.tex", "report.html", "success-planned.pdf"]
+)
+def test_reports_replace_no_files_of_other_origin(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], name: str
+) -> None:
+    (tmp_path / name).write_text("mine")
+    (tmp_path / ".env").write_text("kept")
+    words = ["benchmark", "replan", "--n", "1", "--planners", "cnpgen"]
+    assert main([*words, "-o", str(tmp_path)]) == 2
+    assert f"has no results of a benchmark, but {name}," in capsys.readouterr().err
+    assert {path.name for path in tmp_path.iterdir()} == {name, ".env"}
+    assert (tmp_path / name).read_text() == "mine"
+
+
 def test_mistakes_are_said_in_a_line(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
