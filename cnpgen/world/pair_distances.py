@@ -18,6 +18,8 @@ from cnpgen.world.certified import CertifiedDistance, PlacedBody
 Indices = NDArray[np.intp]
 
 RESOLUTION = 1e-9  # m: tolerance of the smallest distance
+# m: above it an interval is subdivided first, which costs less than a search for a direction.
+MAX_DEVIATION = 10.0
 
 
 @dataclass(frozen=True)
@@ -196,13 +198,15 @@ class PairDistances:
         margins = self.bounds - min_distances[:, None]
         intervals = (margins[:, 1:] + margins[:, :-1] - displacements) / 2 - deviations
         # Only intervals that this does not prove need directions: first the known ones,
-        # then new measurements at both ends.
-        for pair in np.flatnonzero(~(intervals >= 0).all(axis=1)).tolist():
+        # then new measurements at both ends. Intervals in which a point could be anywhere
+        # are left to the caller, who subdivides them.
+        waiting = ~(intervals >= 0) & (deviations < MAX_DEVIATION)
+        for pair in np.flatnonzero(waiting.any(axis=1)).tolist():
             for direction in list(self.directions.get(pair, [])):
                 self._raise(
                     intervals[pair], pair, direction, min_distances[pair] + deviations
                 )
-            for k in np.flatnonzero(~(intervals[pair] >= 0)).tolist():
+            for k in np.flatnonzero(waiting[pair]).tolist():
                 for end in (k, k + 1):
                     if not intervals[pair, k] >= 0:
                         direction = self._measured(pair, end)[1]

@@ -7,7 +7,7 @@ import pytest
 
 from cnpgen.problems.load_robot import load_robot
 from cnpgen.problems.problem_file import load_problem
-from cnpgen.world.pair_distances import RESOLUTION, PairDistances
+from cnpgen.world.pair_distances import MAX_DEVIATION, RESOLUTION, PairDistances
 from cnpgen.world.path import PathWorld
 from cnpgen.world.world import World
 from tests.examples.shaped_robot import write_problem
@@ -174,3 +174,21 @@ def test_a_state_that_cannot_be_measured_is_not_clear_and_resolves_no_others(
     )
     found = pairs.clear_states(0.1)
     np.testing.assert_array_equal(found, [True, False, True])
+
+
+def test_no_direction_is_measured_for_an_interval_in_which_a_point_may_be_anywhere():
+    measured: list[int] = []
+
+    def measure(pair: int, k: int) -> tuple[float, np.ndarray]:
+        measured.append(k)
+        return 0.5, np.array([1.0, 0.0, 0.0])
+
+    def separation(pair: int, direction: np.ndarray, states: np.ndarray) -> np.ndarray:
+        return np.full(len(states), 0.5)
+
+    pairs = PairDistances(np.full((1, 4), -1.0), measure, separation, UNUSED)
+    deviations = np.array([MAX_DEVIATION, 5e303, 0.1])
+    bounds = pairs.interval_bounds(np.zeros(1), np.zeros(3), deviations)
+    assert (bounds[:2] < 0).all()
+    assert bounds[2] == pytest.approx(0.4)
+    assert set(measured) <= {2, 3}
