@@ -197,7 +197,8 @@ def nearest(name: str, known: Iterable[str], *, similarity: float = 0.5) -> str:
     if meant != name and meant in names:
         return f" (did you mean {meant!r}?)"
     # Words in capitals mean the same ones.
-    lower, word = {each.lower(): each for each in names}, name.lower()
+    lower = {each.lower(): each for each in names}
+    word = name.lower()
     completions = [each for each in lower if len(word) > 2 and each.startswith(word)]
     close = (
         difflib.get_close_matches(word, lower, n=1, cutoff=similarity) or completions

@@ -46,7 +46,8 @@ def run(arguments: argparse.Namespace) -> None:
     from cnpgen.store.files.atomic import check_writable, write_file
 
     folder = Path(arguments.folder)
-    recipe, name = load_any(arguments.recipe, arguments.kind), folder.resolve().name
+    recipe = load_any(arguments.recipe, arguments.kind)
+    name = folder.resolve().name
     if not re.match(NAME, name):
         raise UsageError(
             f"DIR must be lower-case letters, digits and hyphens, such as my-hits; got {name!r}"

@@ -115,7 +115,8 @@ def _refusal(workspace: Workspace, spec: DatasetSpec) -> str:
 
 def _progress(folder: Path, spec: DatasetSpec) -> str:
     """Describe the progress of a dataset."""
-    todo, count = len(pending(folder, spec)), len(shards(spec))
+    todo = len(pending(folder, spec))
+    count = len(shards(spec))
     if todo == 0 and (folder / MANIFEST).is_file():
         return "already complete"
     return f"{count - todo} of {count} shards exist: would resume"
@@ -123,8 +124,10 @@ def _progress(folder: Path, spec: DatasetSpec) -> str:
 
 def size_text(number: int) -> str:
     """Write a number of bytes: ``"6.7 MB"``."""
-    value, units = float(number), ["bytes", "kB", "MB", "GB", "TB"]
+    value = float(number)
+    units = ["bytes", "kB", "MB", "GB", "TB"]
     # Units are decimal: 1 kB = 1000 bytes.
     while value >= 1000 and len(units) > 1:
-        value, units = value / 1000, units[1:]
+        value = value / 1000
+        units = units[1:]
     return f"{value:.3g} {units[0]}" if units[0] != "bytes" else f"{number} bytes"

@@ -116,7 +116,8 @@ def _draw(found: "Evaluation", picture: str, index: int | None) -> None:
     from cnpgen.judges.plans.plan_plot import plot_plan
     from cnpgen.plans import open_problem
 
-    plans, chosen = found.plans, _chosen(found) if index is None else index
+    plans = found.plans
+    chosen = _chosen(found) if index is None else index
     problem, robot = open_problem(plans.problem)
     verdict = found.verdicts[chosen]
     note = f"sample {plans.sample_id[chosen]}: {verdict}"

@@ -130,7 +130,8 @@ def _plans(arguments: argparse.Namespace) -> "Plans | JoinedPlans":
     from cnpgen.plans.join import join_plans
 
     plans: Plans | JoinedPlans = recipe_names.read_plans(arguments.file)
-    following, times = arguments.join or [], arguments.at or []
+    following = arguments.join or []
+    times = arguments.at or []
     if times and len(times) != len(following):
         given = f"--at is given {counted(len(times), 'time')}, --join {counted(len(following), 'time')}"
         raise UsageError(f"{given}: expected one for each")

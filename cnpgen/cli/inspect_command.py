@@ -108,7 +108,8 @@ def _yield_lines(sampling: "SamplingStatistics") -> list[str]:
         ("", "", f"{sampling.tried:,}", "", "100.00 %"),
     ]
     # Candidates that are left: each reason takes its count from those that came to it.
-    left, before = sampling.tried, ""
+    left = sampling.tried
+    before = ""
     for reason, count in sampling.rejections.items():
         stage = sampling.stages.get(reason, "")
         accepts = 100 * (1 - count / left) if left else 100.0
@@ -142,12 +143,11 @@ def _field_rows(
     """
     # A column without a name is an empty text; a scalar field has one column.
     columns = field.names or ("",) * max(field.width, 1)
-    rows, before = [], ""
+    rows = []
+    before = ""
     for index, (column, unit) in enumerate(zip(columns, field.units, strict=True)):
-        first, before = (
-            ("" if index else field.name, column, "" if unit == before else unit),
-            unit,
-        )
+        first = ("" if index else field.name, column, "" if unit == before else unit)
+        before = unit
         numbers = (found.minimum, found.mean, found.maximum) if found else ()
         rows.append(
             (

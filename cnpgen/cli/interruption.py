@@ -10,7 +10,8 @@ from pathlib import Path
 from cnpgen.machine.signals import signals_handled
 
 # Exit codes: 128 + SIGINT, 128 + SIGTERM, as shells have it.
-INTERRUPTED, TERMINATED = 130, 143
+INTERRUPTED = 130
+TERMINATED = 143
 
 _interruptions: list[int] = []  # the signal that came first, if any
 

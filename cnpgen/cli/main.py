@@ -111,7 +111,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     """
     # The namespace exists before parsing, so that an error knows the options read so
     # far.
-    words, given = list(sys.argv[1:] if argv is None else argv), argparse.Namespace()
+    words = list(sys.argv[1:] if argv is None else argv)
+    given = argparse.Namespace()
     prefer_one_thread()
     _prepare_streams()
     with printing_safely(), _warnings_on_one_line():
@@ -268,11 +269,9 @@ def notices(level: str = "INFO") -> Iterator[None]:
     """Print the library's log messages of the block on stderr, from a level on, each one once."""
     import logging
 
-    logger, handler, seen = (
-        logging.getLogger("cnpgen"),
-        logging.StreamHandler(sys.stderr),
-        set[str](),
-    )
+    logger = logging.getLogger("cnpgen")
+    handler = logging.StreamHandler(sys.stderr)
+    seen = set[str]()
     # Time since the start [ms] and module only with --verbose.
     text = "%(relativeCreated)d ms, %(name)s: " if level == "DEBUG" else "cnpgen: "
     handler.setFormatter(logging.Formatter(f"{text}%(message)s"))

@@ -190,21 +190,18 @@ def _summary(
     import textwrap
 
     wanted = sum(made.rows.values())
-    text, rest = (
-        _rows_text(made.rows),
-        "" if made.complete else "; other parts are still to be made",
-    )
+    text = _rows_text(made.rows)
+    rest = "" if made.complete else "; other parts are still to be made"
     if part is not None:
         all_rows = counted(sum(made.spec.splits.values()), "row")
-        text, rest = (
-            f"{text}, part {part[0]}/{part[1]} of {all_rows},",
-            rest or "; all parts are made",
-        )
+        text = f"{text}, part {part[0]}/{part[1]} of {all_rows},"
+        rest = rest or "; all parts are made"
     if not made.made:
         return [f"{_unmade(made, part)}: {text.rstrip(',')}{rest}"]
     share = "" if made.made == wanted else f"the missing {made.made:,} of "
     # The time before the last step prepares; a rate needs a time above 0.
-    whole, making = meter.seconds, max(meter.running, 1e-9)
+    whole = meter.seconds
+    making = max(meter.running, 1e-9)
     times = f"in {whole:.1f} s: {whole - making:.1f} s to get ready, then {made.made / making:,.0f} rows/s"
     lines = [
         f"{verb} {share}{text} {times}{rest}",

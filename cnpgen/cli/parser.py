@@ -230,7 +230,8 @@ def refuse_others(arguments: argparse.Namespace, *names: str) -> None:
 
 def add_selection(parser: Options) -> None:
     """Add the options that select samples of a folder, or the number and the seed of fresh ones."""
-    option, selected = parser.add_argument, "first sample of the split (default: 0)"
+    option = parser.add_argument
+    selected = "first sample of the split (default: 0)"
     option("--split", metavar="NAME", help="split of the folder (default: validation)")
     option("--first", metavar="I", type=values.natural, help=selected)
     text = "number of problems; for a folder by default all that follow"

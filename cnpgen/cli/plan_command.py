@@ -95,7 +95,8 @@ def run(arguments: argparse.Namespace) -> int:
     _complete(arguments)
     model = load_model(arguments.model)
     requests = _requests(arguments, model)
-    request, out = _request(arguments, requests), arguments.out
+    request = _request(arguments, requests)
+    out = arguments.out
     # With --refine, ``refine_and_save`` compares its own request.
     if not arguments.refine and is_finished(out, request, force=arguments.force):
         return report_finished(arguments, out)
@@ -153,7 +154,8 @@ def _complete(arguments: argparse.Namespace) -> None:
     """
     from cnpgen.planner.model_file import shipped_models
 
-    name, recipe = arguments.problems, recipe_names.is_recipe(arguments.problems)
+    name = arguments.problems
+    recipe = recipe_names.is_recipe(arguments.problems)
     if recipe and arguments.model is None and name in shipped_models():
         arguments.model = name
     if recipe and arguments.out is None:

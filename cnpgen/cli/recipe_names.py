@@ -92,7 +92,8 @@ def _recipe_or_path(kinds: tuple[str, ...], text: str) -> str:
     from cnpgen.store.paths import similar_path
 
     text = str(local_folder(text))
-    names, path = _shipped(*kinds), Path(text)
+    names = _shipped(*kinds)
+    path = Path(text)
     check_readable(path)
     if (
         path.suffix.lower() not in _TEXTS

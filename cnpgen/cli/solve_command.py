@@ -121,7 +121,8 @@ def _solve_scenes(arguments: argparse.Namespace, out: Path) -> int:
         refuse(arguments, ["stay_within"], STAY_WITHIN)
     problem = as_problem(arguments.robot)
     scenes = _scenes(arguments, problem.robot.joints)
-    record, initial = record_problem(problem), None
+    record = record_problem(problem)
+    initial = None
     if arguments.initial_plans is not None:
         initial = recipe_names.read_plans(arguments.initial_plans, problem=None)
     # What the result depends on; parts that are absent leave earlier requests equal.
@@ -164,7 +165,8 @@ def _scenes(
             f"--start must have {len(joints)} positions of {listed(joints)}, got {len(positions)}"
         )
     start = dict(zip(joints, positions, strict=False))
-    unused, packages = arguments.allow_unused or (), arguments.packages or ()
+    unused = arguments.allow_unused or ()
+    packages = arguments.packages or ()
     return read_scenes(
         Path(arguments.what),
         start=arguments.first or 0,

@@ -88,14 +88,17 @@ class Meter:
     def __init__(self, *, quiet: bool = False, noun: str = "row") -> None:
         self.rows = 0
         self.sampling: SamplingStatistics | None = None
-        self._quiet, self._noun = quiet, noun
+        self._quiet = quiet
+        self._noun = noun
         self._start = self._begun = time.perf_counter()
         self._bar: Any = None
 
     def begin(self, title: str, total: int, initial: int = 0) -> None:
         """Show the start of a step with ``total`` samples, of which ``initial`` exist; the previous step is over."""
         self.close()
-        self.rows, self.sampling, self._begun = 0, None, time.perf_counter()
+        self.rows = 0
+        self.sampling = None
+        self._begun = time.perf_counter()
         # A terminal has a bar that moves; a file or a pipe gets one line per step.
         if not self._quiet and sys.stderr.isatty():
             from tqdm import tqdm
@@ -182,7 +185,8 @@ def table(
     ]
     # Further lines of the last column begin below its first one: two spaces per column.
     hanging = indent + " " * (sum(widths) + 2 * len(widths))
-    space, count = max(width - len(hanging), 30), 1 if one_line else None
+    space = max(width - len(hanging), 30)
+    count = 1 if one_line else None
     wrapper = TextWrapper(
         space,
         break_on_hyphens=False,

@@ -82,19 +82,22 @@ class Watch:
     """Shows how training goes."""
 
     def __init__(self, *, quiet: bool) -> None:
-        self._meter, self._quiet = Meter(quiet=quiet, noun="step"), quiet
+        self._meter = Meter(quiet=quiet, noun="step")
+        self._quiet = quiet
         self._last = 0
         self._seen: Mapping[str, Any] = {}
 
     def begin(self, state: "State", run: "Run") -> None:
         """Say what begins."""
-        step, steps = state.adam.step, state.steps
+        step = state.adam.step
+        steps = state.steps
         self._last = step
         parameters = run.learner.architecture.n_parameters
         self._meter.begin(
             f"training {parameters:,} parameters on {len(run.rows):,} rows", steps, step
         )
-        wanted, taken = run.learner.settings.batch_size, run.order.batch_size
+        wanted = run.learner.settings.batch_size
+        taken = run.order.batch_size
         if taken < wanted and not self._quiet:
             print(
                 f"every step takes all {taken:,} rows: there are no {wanted:,} for a batch",
@@ -162,7 +165,8 @@ def _train(arguments: argparse.Namespace, watch: Watch) -> "Trained":
     from cnpgen.training.train import train_model
     from cnpgen.training.training_options import TrainingOptions
 
-    preset, length = PRESETS.get(arguments.preset), options_of(arguments, *_LENGTHS)
+    preset = PRESETS.get(arguments.preset)
+    length = options_of(arguments, *_LENGTHS)
     # A length that is given replaces that of the preset as a whole.
     if preset is not None and all(value is None for value in length.values()):
         length = dict(vars(preset.length))
@@ -238,7 +242,8 @@ def _terms(record: Mapping[str, Any]) -> str:
     """Say how large the terms are, as multiples of their budgets where they have one, and their weights."""
     words = []
     for name, weight in record["weights"].items():
-        value, budget = record["terms"][name], record["budgets"][name]
+        value = record["terms"][name]
+        budget = record["budgets"][name]
         amount = f"{value / budget:.2g}" if budget else f"({value:.2g})"
         words.append(f"{name} {amount} x {weight:.2g}")
     head = f"loss {record['loss']:.4g}, learning rate {record['learning_rate']:.2g}; terms / budgets x weights: "
@@ -248,11 +253,9 @@ def _terms(record: Mapping[str, Any]) -> str:
 def summary(trained: "Trained") -> str:
     """Say in a line what came of a run."""
     training = trained.model.training
-    steps, best, words = (
-        f"{training['steps']:,} steps",
-        f"{training['best_step']:,}",
-        _words(trained.score),
-    )
+    steps = f"{training['steps']:,} steps"
+    best = f"{training['best_step']:,}"
+    words = _words(trained.score)
     if not trained.made:
         return _fitted(
             f"already trained: {steps}, of which that of step {best}: {words}"

@@ -74,7 +74,8 @@ def part(text: str) -> tuple[int, int]:
     except ValueError:
         # No part is valid with these numbers, so that the text below describes the
         # error.
-        k, m = 0, 0
+        k = 0
+        m = 0
     if not 0 <= k < m:
         raise ArgumentTypeError(
             f"expected K/M with 0 <= K < M, such as 0/8 for the first of eight; got {text!r}"

@@ -38,7 +38,8 @@ def summary_text(file: Path, found: "Evaluation") -> str:
     """Format the summary of all plans."""
     from cnpgen.judges.plans.sampling import MAX_TIME_SAMPLES
 
-    summary, count = found.summary(), len(found.verdicts)
+    summary = found.summary()
+    count = len(found.verdicts)
     step = f"{1e3 * found.step:g} ms"
     if (found.plans.duration > MAX_TIME_SAMPLES * found.step).any():
         step += f" or of {MAX_TIME_SAMPLES:,} in all"
@@ -204,7 +205,8 @@ def listing_text(found: "Evaluation") -> str:
         figures = [
             "-" if value is None else _figure(form, value) for form, value in values
         ]
-        verdict, sample = found.verdicts[index], int(found.plans.sample_id[index])
+        verdict = found.verdicts[index]
+        sample = int(found.plans.sample_id[index])
         why = _why(verdict) or "-"
         rows.append((str(index), str(sample), str(verdict.reason), *figures, why))
     right = [column for column in range(len(rows[0])) if column != 2]

@@ -105,7 +105,8 @@ def build_libraries(libraries: Sequence[Sequence[Path]], folder: Path) -> list[P
             with tempfile.TemporaryDirectory(dir=folder, prefix=".build-") as scratch:
                 source = Path(scratch) / paths[-1].name
                 source.write_text(source_text(paths), encoding="utf-8")
-                library, compiler = source.with_suffix(".so"), require_compiler()
+                library = source.with_suffix(".so")
+                compiler = require_compiler()
                 flags = LEVEL, variant.flag(compiler)
                 run_compiler(compiler, flags, source, library)
                 library.replace(file)
@@ -221,10 +222,8 @@ def _build(stem: str, source: str, cache_folder: Path) -> Path:
     else:
         _LOG.info("compiling C code, once per machine")
     with tempfile.TemporaryDirectory(dir=libraries, prefix=".build-") as folder:
-        source_file, built = (
-            Path(folder) / f"{stem.rpartition('-')[0]}.c",
-            Path(folder) / "kernel.so",
-        )
+        source_file = Path(folder) / f"{stem.rpartition('-')[0]}.c"
+        built = Path(folder) / "kernel.so"
         source_file.write_text(source, encoding="utf-8")
         flags = (LEVEL, *native_flags())
         run_compiler(require_compiler(), flags, source_file, built)

@@ -40,7 +40,8 @@ MAX_DIRECT = (
     1000  # instructions of kernels that get final code at once, in at most 0.1 s
 )
 DIGEST_BYTES = 32
-CODE, REQUEST = ".o", ".tape"
+CODE = ".o"
+REQUEST = ".tape"
 _LOG = logging.getLogger(__name__)
 _loaded: dict[tuple[Path, str], LoadedCode] = {}  # final code of this process
 

@@ -78,10 +78,8 @@ class CompiledKernel(Kernel):
         self._address = kernel_address(tape, cache_folder)
         sizes = len(tape.inputs), len(tape.outputs)
         widths = (ctypes.c_long * sum(sizes))(*tape.inputs, *tape.outputs)
-        self._callee, self._call = (
-            _Callee(self._address, *sizes, widths),
-            _load_call(cache_folder),
-        )
+        self._callee = _Callee(self._address, *sizes, widths)
+        self._call = _load_call(cache_folder)
 
     def __call__(self, *arguments: Array) -> list[Array]:
         """Evaluate the batch; see ``Kernel``."""

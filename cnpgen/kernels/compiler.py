@@ -122,7 +122,8 @@ def _run(
     Raises:
         MachineError: It does not run, or exceeds the time limit.
     """
-    command, pipe = [*shlex.split(compiler), *options], subprocess.PIPE
+    command = [*shlex.split(compiler), *options]
+    pipe = subprocess.PIPE
     variables = dict(os.environ)
     if "ziglang" in command:
         variables.setdefault("ZIG_GLOBAL_CACHE_DIR", str(_zig_folder()))

@@ -67,7 +67,8 @@ class _LaneBlock:
 
     def run(self, read: Read, write: Write) -> None:
         """Run the program."""
-        self._read, self._write = read, write
+        self._read = read
+        self._write = write
         for step in self._steps:
             step()
 
@@ -85,7 +86,8 @@ class _BlockProgram:
     """
 
     def __init__(self, tape: Tape, grid: GridSpec) -> None:
-        self._grid, self._dtype = grid, tape.dtype
+        self._grid = grid
+        self._dtype = tape.dtype
         self._slots, self._program = _allocate(tape)
 
     def run(
@@ -102,10 +104,8 @@ class _BlockProgram:
         with np.errstate(all="ignore"):
             for node in range(0, k, count):
                 for lane in range(0, n, POINTS_PER_BLOCK):
-                    nodes, lanes = (
-                        slice(node, min(node + count, k)),
-                        slice(lane, min(lane + POINTS_PER_BLOCK, n)),
-                    )
+                    nodes = slice(node, min(node + count, k))
+                    lanes = slice(lane, min(lane + POINTS_PER_BLOCK, n))
                     shape = nodes.stop - node, lanes.stop - lane
                     # The last block along an axis is smaller; it works on parts of the
                     # same rows.

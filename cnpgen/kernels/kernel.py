@@ -78,7 +78,9 @@ def evaluate_lanes(
     n = check_arguments(tape, arguments)
     if tape.loop is None:
         return evaluate(arguments, n)
-    state, error, active = arguments[0].copy(), np.full((1, n), np.nan), np.arange(n)
+    state = arguments[0].copy()
+    error = np.full((1, n), np.nan)
+    active = np.arange(n)
     for _ in range(tape.loop.limit):
         if len(active) == 0:
             break
@@ -88,7 +90,8 @@ def evaluate_lanes(
         if len(active) < n:
             inputs = [np.ascontiguousarray(x[:, active]) for x in inputs]
         next_state, next_error = evaluate(inputs, len(active))
-        state[:, active], error[:, active] = next_state, next_error
+        state[:, active] = next_state
+        error[:, active] = next_error
         # A comparison with nan is false: a lane with the error nan stays active to the
         # limit.
         active = active[~(next_error[0] < tape.loop.tolerance)]
@@ -129,7 +132,8 @@ class GridKernel(ABC):
     def __init__(self, tape: Tape) -> None:
         if tape.grid is None:
             raise ValueError(f"kernel {tape.name}: its tape has no grid")
-        self.tape, self.grid = tape, tape.grid
+        self.tape = tape
+        self.grid = tape.grid
 
     @abstractmethod
     def __call__(self, *arguments: NDArray[Any], out: Sequence[NDArray[Any]]) -> None:

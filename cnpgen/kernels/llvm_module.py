@@ -135,7 +135,9 @@ ret void
 def _iterated_lanes(tape: Tape, steps: list[ArithmeticStep], text: StepText) -> str:
     """Return the function that iterates full vectors of lanes; converged lanes keep their values."""
     assert tape.loop is not None
-    vector, flags, width = text.vector, text.flags, tape.inputs[0]
+    vector = text.vector
+    flags = text.flags
+    width = tape.inputs[0]
     # State and parameters are loaded once; only the state changes between steps.
     names = {
         (argument, component): f"%i{argument}_{component}"
@@ -175,7 +177,8 @@ def _iterated_lanes(tape: Tape, steps: list[ArithmeticStep], text: StepText) -> 
         + f"store {vector} %next{i}, ptr %end{i}, align {text.size}"
         for i in range(width)
     )
-    error, tolerance = results[1, 0], text.number(tape.loop.tolerance)
+    error = results[1, 0]
+    tolerance = text.number(tape.loop.tolerance)
     return f"""{_head(tape, text)}
 block:
 %k = phi i64 [0, %entry], [%k1, %finished]
@@ -218,7 +221,8 @@ def _summed(tape: Tape) -> set[int]:
 
 def _tail(tape: Tape, lanes: int, real: str) -> str:
     """Return the function that evaluates fewer lanes than a vector has, from lane %first on."""
-    inputs, outputs = len(tape.inputs), len(tape.outputs)
+    inputs = len(tape.inputs)
+    outputs = len(tape.outputs)
     lines = [
         "define internal void @tail(i64 %first, i64 %rest, ptr %in, ptr %ld, ptr %out, ptr %lo) {",
         *(
@@ -235,7 +239,9 @@ def _tail(tape: Tape, lanes: int, real: str) -> str:
     ]  # fmt: skip
     # Copies are packed: every row has as many lanes as a vector, whatever its stride
     # was.
-    uniform, summed, position = uniform_arguments(tape), _summed(tape), 0
+    uniform = uniform_arguments(tape)
+    summed = _summed(tape)
+    position = 0
     for i, width in enumerate(tape.inputs):
         lines.append(_copied("in", "ld", i, f"inputs, i64 {position}", real))
         # The padding repeats the last lane, so that an iteration ends as soon as the
@@ -321,13 +327,15 @@ ret void
 def _grid_kernel(tape: Tape, real: str) -> str:
     """Return the entry point with a grid: nodes are the outer loop, so that rows are read contiguously."""
     assert tape.grid is not None
-    inputs, outputs = len(tape.inputs), len(tape.outputs)
+    inputs = len(tape.inputs)
+    outputs = len(tape.outputs)
     axes = (*tape.grid.arguments, *tape.grid.results)
     rows = [("in", "ld", i) for i in range(inputs)]
     rows += [("out", "lo", i) for i in range(outputs)]
     # The strides between components are equal for all nodes: store them once, and move
     # only the pointers from node to node.
-    before, inside = [], []
+    before = []
+    inside = []
     for (name, strides, i), kind in zip(rows, axes, strict=True):
         before.append(
             f"%{name}p{i} = getelementptr ptr, ptr %{name}, i64 {i}\n%{name}b{i} = load ptr, ptr %{name}p{i}\n"

@@ -147,8 +147,10 @@ class StepText:
 
     def __init__(self, tape: Tape, lanes: int) -> None:
         self.real, _, suffix, *_ = CONSTANTS[tape.dtype]
-        self.lanes, self.size = lanes, np.dtype(tape.dtype).itemsize
-        self.vector, self.flags = f"<{lanes} x {self.real}>", f"<{lanes} x i1>"
+        self.lanes = lanes
+        self.size = np.dtype(tape.dtype).itemsize
+        self.vector = f"<{lanes} x {self.real}>"
+        self.flags = f"<{lanes} x i1>"
         self._fma = f"@llvm.fma.v{lanes}{suffix}"
         self._templates = _templates(tape.dtype, lanes)
         self._single = tape.dtype == "float32"
@@ -172,7 +174,8 @@ class StepText:
         lines: list[str] = []
         names: list[str] = []
         for k, step in enumerate(steps):
-            name, operands = f"%t{k}", step.operands
+            name = f"%t{k}"
+            operands = step.operands
             if step.operation == "constant":
                 names.append(self.number(step.value))
                 continue
@@ -191,11 +194,14 @@ class StepText:
 
     def _fused(self, k: int, step: ArithmeticStep, a: str, b: str, c: str) -> str:
         """Return ``a b + c`` with one rounding; the signs are exact."""
-        v, lines = self.vector, ""
+        v = self.vector
+        lines = ""
         if step.signs[0]:
-            lines, a = f"%a{k} = fneg {v} {a}\n", f"%a{k}"
+            lines = f"%a{k} = fneg {v} {a}\n"
+            a = f"%a{k}"
         if step.signs[1]:
-            lines, c = lines + f"%c{k} = fneg {v} {c}\n", f"%c{k}"
+            lines = lines + f"%c{k} = fneg {v} {c}\n"
+            c = f"%c{k}"
         return lines + f"%t{k} = call {v} {self._fma}({v} {a}, {v} {b}, {v} {c})"
 
 

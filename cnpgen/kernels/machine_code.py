@@ -15,10 +15,8 @@ from typing import Any
 from cnpgen.errors import MachineError
 
 # Levels: generated ten times faster; as fast as an optimizing compiler's code.
-FIRST, FINAL = (
-    0,
-    1,
-)
+FIRST = 0
+FINAL = 1
 SOURCES = (
     "steps",
     "lowering",

@@ -142,7 +142,8 @@ class Replacer:
 
     def after_fork_in_child(self) -> None:
         """Start the thread again, which a forked process lacks; the parent's processes are not its own."""
-        self._thread, self._processes = None, []
+        self._thread = None
+        self._processes = []
         self._mutex.release()
         self._start_thread()
 

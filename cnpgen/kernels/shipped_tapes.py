@@ -15,7 +15,8 @@ from zipfile import BadZipFile, ZipFile
 from cnpgen.kernels.tape import Tape
 
 FOLDER = Path(__file__).with_name("shipped")
-INDEX, ARCHIVE = "index.json", "tapes.zip"
+INDEX = "index.json"
+ARCHIVE = "tapes.zip"
 
 
 def find_shipped(key: str) -> Tape | None:

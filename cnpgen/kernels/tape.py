@@ -122,13 +122,16 @@ class Tape:
         Raises:
             ValueError: The checksum is wrong.
         """
-        checksum, content = data[:32], data[32:]
+        checksum = data[:32]
+        content = data[32:]
         if hashlib.sha256(content).digest() != checksum:
             raise ValueError("damaged tape: its checksum is wrong")
         head, _, body = content.partition(b"\n")
         header = json.loads(head)
         sizes = {name: np.dtype(kind).itemsize for name, kind in STORED_TYPES.items()}
-        count, first, columns = len(body) // sum(sizes.values()), 0, {}
+        count = len(body) // sum(sizes.values())
+        first = 0
+        columns = {}
         for name, kind in STORED_TYPES.items():
             columns[name] = np.frombuffer(body, kind, count, first)
             first += count * sizes[name]
@@ -185,20 +188,16 @@ def _columns(function: Any) -> tuple[NDArray[Any], ...]:
     # The codes of operations are those of the installed CasADi: find them by name.
     known = {getattr(ca, f"OP_{name}"): name for name in OPERATIONS}
     count = function.n_instructions()
-    operation, a, b = (
-        np.zeros(count, np.int16),
-        np.zeros(count, np.int32),
-        np.zeros(count, np.int32),
-    )
+    operation = np.zeros(count, np.int16)
+    a = np.zeros(count, np.int32)
+    b = np.zeros(count, np.int32)
     constant = np.zeros(count)
     # Slot of the work vector -> index of its present value.
     contents: dict[int, int] = {}
     for k in range(count):
-        code, out, operands = (
-            function.instruction_id(k),
-            function.instruction_output(k),
-            function.instruction_input(k),
-        )
+        code = function.instruction_id(k)
+        out = function.instruction_output(k)
+        operands = function.instruction_input(k)
         name = known.get(code)
         if name is None:
             raise ValueError(
@@ -212,7 +211,9 @@ def _columns(function: Any) -> tuple[NDArray[Any], ...]:
         elif name == "OUTPUT":
             # A slot of the work vector is reused: ``contents`` finds the instruction
             # that wrote it last.
-            a[k], b[k], constant[k] = contents[operands[0]], out[0], out[1]
+            a[k] = contents[operands[0]]
+            b[k] = out[0]
+            constant[k] = out[1]
         else:
             a[k] = contents[operands[0]]
             b[k] = contents[operands[1]] if OPERATIONS[name] == 2 else 0

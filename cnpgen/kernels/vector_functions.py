@@ -106,13 +106,15 @@ def sine_and_cosine(steps: StepList, x: int) -> tuple[int, int]:
 def exponential(steps: StepList, x: int) -> int:
     """Enter the exponential: exp(x) = 2^n exp(r) with r = x - n ln 2."""
     p = SINGLE if steps.single else DOUBLE
-    shift, limit = steps.number(p.rounding_shift), steps.number(p.max_exponent)
+    shift = steps.number(p.rounding_shift)
+    limit = steps.number(p.max_exponent)
     # The result is 0 or infinite beyond the limit, so clipping does not change it.
     clipped = steps.add("lesser", x, limit)
     clipped = steps.add("larger", clipped, steps.number(-p.max_exponent))
     shifted = steps.add("add", steps.add("mul", clipped, steps.number(p.log2e)), shift)
     # n = round(x / ln 2), and r = x - n ln 2, one part of ln 2 after the other.
-    n, r = steps.add("sub", shifted, shift), clipped
+    n = steps.add("sub", shifted, shift)
+    r = clipped
     for part in p.ln2:
         r = steps.add("sub", r, steps.add("mul", n, steps.number(part)))
     reduced = _reduced_single(steps, r) if steps.single else _reduced_double(steps, r)

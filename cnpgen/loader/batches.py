@@ -177,12 +177,10 @@ class Batches:
                 concerns="batch_size",
             )
         partition.check_ranks(source.rows, first=position.row)
-        self._source, self._row_format, self._partition, self._position = (
-            source,
-            row_format,
-            partition,
-            position,
-        )
+        self._source = source
+        self._row_format = row_format
+        self._partition = partition
+        self._position = position
         self._in_memory: InMemoryRows | None = None
         self._observe = observe
         self.times_set = 0
@@ -193,7 +191,8 @@ class Batches:
         return self.__dict__ | {"_in_memory": None, "worker_positions": None}
 
     def __repr__(self) -> str:
-        source, position = self._source, self._position
+        source = self._source
+        position = self._position
         place = f"seed {position.seed}, epoch {position.epoch}, row {position.row:,}"
         rows = f"{self._partition.batch_size} of the {source.rows:,} rows of split {source.split!r}"
         return f"<batches of {rows}, at {place}: {self._row_format.layout.summary}>"
@@ -230,7 +229,8 @@ class Batches:
             DatasetError: A shard is missing or damaged.
             UsageError: The position was changed between two batches.
         """
-        source, partition = self._source, self._partition
+        source = self._source
+        partition = self._partition
         begin = position = self._position = self._forward(self._position)
         rows = tuple(shard.rows for shard in source.shards)
         order = Order(source.split, rows, begin.seed, begin.epoch, begin.shuffle)
@@ -238,7 +238,8 @@ class Batches:
             source, self._row_format
         )
         windows = Windows(source, self._row_format, order, self._in_memory)
-        row, end = begin.row, partition.end(source.rows, first=begin.row)
+        row = begin.row
+        end = partition.end(source.rows, first=begin.row)
         while (first := row + partition.worker * partition.batch_size) < end:
             batch = windows.batch(
                 first,

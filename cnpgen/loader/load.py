@@ -59,7 +59,8 @@ def load_dataset(
     if stored.manifest is None:
         summary = summarize_dataset(folder, stored.spec, allow_incomplete=True)
         # Without a manifest the sidecars are the only records.
-        statistics, made = summary.statistics, summary.records
+        statistics = summary.statistics
+        made = summary.records
         recorded = [
             Shard(folder, stored.spec, task, record.bytes, record.sha256)
             for task, record in made
@@ -85,7 +86,8 @@ def load_dataset(
 
 def _load_statistics(folder: Path, spec: DatasetSpec) -> Statistics:
     """Read the statistics of a finished dataset."""
-    path, document = folder / STATS, load_stats_document(folder)
+    path = folder / STATS
+    document = load_stats_document(folder)
     if document["specification_fingerprint"] != spec.fingerprint:
         raise DatasetError(
             f"{path} is of another specification than {SPECIFICATION}; {RERUN_HINT}"

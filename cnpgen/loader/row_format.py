@@ -72,17 +72,13 @@ class Normalization:
         }
 
     def _scaled(self, name: str, values: Any) -> Any:
-        mean, scale = (
-            _as_type_of(values, self.mean[name]),
-            _as_type_of(values, self.scale[name]),
-        )
+        mean = _as_type_of(values, self.mean[name])
+        scale = _as_type_of(values, self.scale[name])
         return _with_type_of(values, (values - mean) * scale)
 
     def _unscaled(self, name: str, values: Any) -> Any:
-        mean, std = (
-            _as_type_of(values, self.mean[name]),
-            _as_type_of(values, self.std[name]),
-        )
+        mean = _as_type_of(values, self.mean[name])
+        std = _as_type_of(values, self.std[name])
         return _with_type_of(values, values * std + mean)
 
     def side_by_side(self, fields: Sequence[Field]) -> tuple[Floats, Floats]:
@@ -103,10 +99,8 @@ class Normalization:
             raise DatasetError(
                 f"there are no statistics to normalize {', '.join(missing)} with, only those of {', '.join(self.mean)}"
             )
-        empty, width = (
-            np.empty(0),
-            {field.name: max(field.width, 1) for field in fields},
-        )
+        empty = np.empty(0)
+        width = {field.name: max(field.width, 1) for field in fields}
         # Fields of scenes have mean 0 and scale 1, which leaves them as they are.
         mean = [self.mean.get(name, np.zeros(count)) for name, count in width.items()]
         scale = [self.scale.get(name, np.ones(count)) for name, count in width.items()]
@@ -134,7 +128,8 @@ def make_normalization(
     resolution of its largest value. Otherwise its rounding errors would be scaled to
     size 1, such as those of the height of a tip on a table.
     """
-    mean, std = {}, {}
+    mean = {}
+    std = {}
     for field in fields:
         if field.dtype == "float" and field.name in statistics:
             item = statistics[field.name]
@@ -168,7 +163,8 @@ class Columns:
     @cached_property
     def slices(self) -> dict[str, slice]:
         """Field name -> columns of the table."""
-        slices, start = {}, 0
+        slices = {}
+        start = 0
         for field in self.floats:
             slices[field.name] = slice(start, start + max(field.width, 1))
             start += max(field.width, 1)

@@ -106,7 +106,8 @@ class ShardReader:
     """
 
     def __init__(self, *, verify: bool, obstacles: Sequence[Obstacle] = ()) -> None:
-        self._verify, self._obstacles = verify, tuple(obstacles)
+        self._verify = verify
+        self._obstacles = tuple(obstacles)
         # Of the last shard whose scenes were read.
         self._scenes: tuple[Path, SceneTable] | None = None
         # Of the checked shards.

@@ -63,7 +63,8 @@ class Order:
         count = min(
             max(round(sum(self.shard_rows) / WINDOW_ROWS), 1), max(len(shards), 1)
         )
-        windows, first = [], 0
+        windows = []
+        first = 0
         for members in np.array_split(shards, count):
             rows = sum(self.shard_rows[shard] for shard in members)
             windows.append(Window(first, rows, tuple(members.tolist())))
@@ -140,15 +141,15 @@ def pack(
     shards: Sequence[Shard], row_format: RowFormat, reader: ShardReader, *, out: Packed
 ) -> None:
     """Read whole shards into ``out``, one after the other."""
-    layout, first, normalization = row_format.layout, 0, row_format.normalization
+    layout = row_format.layout
+    first = 0
+    normalization = row_format.normalization
     scaling = (
         None if normalization is None else normalization.side_by_side(layout.floats)
     )
     for shard in shards:
-        columns, part = (
-            reader.read(shard, layout.fields),
-            out.part(first, first + shard.rows),
-        )
+        columns = reader.read(shard, layout.fields)
+        part = out.part(first, first + shard.rows)
         if layout.floats:
             _fill(part.table, {name: columns[name] for name in layout.slices}, scaling)
         for name, values in part.integers.items():
@@ -199,7 +200,8 @@ def _targets(
     buffer: NDArray[np.float64], columns: Mapping[str, NDArray[Any]]
 ) -> dict[str, NDArray[Any]]:
     """View the part of the buffer for every column as one opaque item per row."""
-    targets, start = {}, 0
+    targets = {}
+    start = 0
     for name, values in columns.items():
         size = 8 * math.prod(values.shape[1:])
         targets[name] = np.ndarray(
@@ -216,7 +218,8 @@ class InMemoryRows:
     """
 
     def __init__(self, source: SplitShards, row_format: RowFormat) -> None:
-        self._source, self._row_format = source, row_format
+        self._source = source
+        self._row_format = row_format
         self._firsts = np.cumsum([0, *(shard.rows for shard in source.shards)]).tolist()
         self._loaded: set[int] = set()
         self.packed = empty_packed(source.rows, row_format)
@@ -229,7 +232,8 @@ class InMemoryRows:
         """
         positions = [np.empty(0, np.int64)]
         for index in shards:
-            shard, first = self._source.shards[index], self._firsts[index]
+            shard = self._source.shards[index]
+            first = self._firsts[index]
             if index not in self._loaded:
                 out = self.packed.part(first, first + shard.rows)
                 pack([shard], self._row_format, self._source.reader, out=out)
@@ -282,12 +286,10 @@ class Windows:
         order: Order,
         in_memory: InMemoryRows | None,
     ) -> None:
-        self._source, self._row_format, self._order, self._in_memory = (
-            source,
-            row_format,
-            order,
-            in_memory,
-        )
+        self._source = source
+        self._row_format = row_format
+        self._order = order
+        self._in_memory = in_memory
         self._firsts = [window.first for window in order.windows]
         self._futures: dict[int, Future[Loaded]] = {}
         # Memory of two windows, reused in turn, because allocating it takes as long as
@@ -297,7 +299,8 @@ class Windows:
 
     def batch(self, first: int, last: int, *, rank: int = 0, world: int = 1) -> Batch:
         """Return the rows at the positions ``range(first + rank, last, world)``, in new arrays."""
-        tables, integers = [], []
+        tables = []
+        integers = []
         for packed, rows in self._rows_by_window(first + rank, last, world):
             tables.append(packed.table.take(rows, axis=0))
             integers.append(
@@ -342,7 +345,9 @@ class Windows:
         """Wait for a window, start loading the next one and release the previous ones."""
         if self._process != os.getpid():
             # Threads do not survive a fork, so their results would never arrive.
-            self._process, self._futures, self._memory = os.getpid(), {}, {}
+            self._process = os.getpid()
+            self._futures = {}
+            self._memory = {}
         if index + 1 not in self._futures:
             self._futures = {
                 other: future
@@ -360,7 +365,8 @@ class Windows:
         return self._futures[index]
 
     def _pack(self, index: int) -> Loaded:
-        window, rows = self._order.windows[index], self._order.rows_of(index)
+        window = self._order.windows[index]
+        rows = self._order.rows_of(index)
         if self._in_memory is not None:
             return self._in_memory.packed, self._in_memory.load(window.shards)[rows]
         # Windows alternate between two buffers: one is read while the other is filled.

@@ -18,7 +18,8 @@ from cnpgen.robots.robot import Robot
 from cnpgen.robots.scene import Scene
 
 # Every fourth node; which ones depends on 16ths of the shift.
-NODE_STRIDE, SHIFTS = 4, 16
+NODE_STRIDE = 4
+SHIFTS = 16
 # In addition to the required one, so that plans keep it after training.
 TRAINING_DISTANCE_M = 0.02
 

@@ -46,7 +46,8 @@ def task_term(state: SymbolicState, objective: Sequence[ObjectiveTerm]) -> Term:
     """
     import casadi as ca
 
-    value, parts = ca.SX(1), []
+    value = ca.SX(1)
+    parts = []
     for term in objective:
         residuals = term.training_residuals(state)
         squares = dot(residuals, residuals)
@@ -78,7 +79,8 @@ def constraint_term(
     """
     import casadi as ca
 
-    value, parts = ca.SX(0), []
+    value = ca.SX(0)
+    parts = []
     for (g, lower, upper), width in zip(
         _bounded(conditions, factor, inset), relaxation, strict=True
     ):
@@ -113,7 +115,8 @@ def _bounded(
                 )
             elif np.isfinite(low) and np.isfinite(high):
                 # Two-sided limits shrink toward their center: |g - c| <= factor h.
-                center, half = (low + high) / 2, (high - low) / 2
+                center = (low + high) / 2
+                half = (high - low) / 2
                 yield g, center - half * factor, center + half * factor
             else:
                 # A one-sided limit moves towards zero by the fraction (1 - factor) of
@@ -182,11 +185,9 @@ def loss_gradient(robot: Robot, problem: Problem, *, form: str) -> Any:
     import casadi as ca
 
     inputs, state, terms = _stage(robot, problem, form)
-    n, step, weights = (
-        robot.n,
-        inputs.node / inputs.rate[0],
-        [1.0, *ca.vertsplit(inputs.weights)],
-    )
+    n = robot.n
+    step = inputs.node / inputs.rate[0]
+    weights = [1.0, *ca.vertsplit(inputs.weights)]
     g = [part for term in terms for part, _ in term.parts]
     # Reverse mode: seeds are d(sum of weighted terms)/d(part), so that one product with
     # the transposed Jacobian of all parts gives the gradient in (p, p', ..., r, r', ...).
@@ -197,7 +198,8 @@ def loss_gradient(robot: Robot, problem: Problem, *, form: str) -> Any:
     ]
     # Densify: the gradient with respect to an argument that does not occur is zero, not
     # absent.
-    states, width = ca.vertcat(*inputs.path, inputs.rate), len(inputs.path) * n
+    states = ca.vertcat(*inputs.path, inputs.rate)
+    width = len(inputs.path) * n
     gradient = ca.densify(ca.jtimes(ca.vertcat(*g), states, ca.vertcat(*seeds), True))
     total = sum(
         weight * term.value for weight, term in zip(weights, terms, strict=True)
@@ -276,7 +278,8 @@ def _stage(
     """Return the inputs, the state as a function of them, and the terms of the task and the constraints."""
     import casadi as ca
 
-    sym, m = ca.SX.sym, len(problem.constraint)
+    sym = ca.SX.sym
+    m = len(problem.constraint)
     path, rate, obstacle_poses, state = _state_on_path(robot, problem)
     pairs = penalized_conditions(problem.constraint, state, form)
     # Conditions in the order of the constraints; those with time-varying bounds take
@@ -286,7 +289,8 @@ def _stage(
     ]
     varying = [has_time_varying_bound(constraint) for constraint, _ in pairs]
     width = sum(size for size, varies in zip(sizes, varying, strict=True) if varies)
-    relaxation, tightening = sym("relaxation", width), sym("tightening", 2 * m)
+    relaxation = sym("relaxation", width)
+    tightening = sym("tightening", 2 * m)
     inputs = Inputs(
         path,
         rate,
@@ -314,13 +318,16 @@ def _state_on_path(
     """Return the columns of path, rate and obstacle poses, and the state at one phase as a function of them."""
     import casadi as ca
 
-    sym, n, orders = ca.SX.sym, robot.n, problem.path_orders
+    sym = ca.SX.sym
+    n = robot.n
+    orders = problem.path_orders
     path = tuple(sym("d" * order + "p", n) for order in range(orders))
     rate = sym("rate", orders - 1)
     obstacle_poses = sym("obstacle_poses", problem.scene_width)
     q, *derivatives = (ca.vertsplit(column) for column in path)
     dq, ddq, jerk = time_derivatives(derivatives, ca.vertsplit(rate))
-    poses, size = ca.vertsplit(obstacle_poses), problem.object_size
+    poses = ca.vertsplit(obstacle_poses)
+    size = problem.object_size
     state = FrozenState(robot, q, dq, ddq, poses, problem.obstacle, size, jerk)
     return path, rate, obstacle_poses, state
 

@@ -178,7 +178,8 @@ class Metric:
         budgets: ArrayLike,
         settings: MetricSettings | None = None,
     ) -> None:
-        first, self._budgets = numbers("weights", weights), numbers("budgets", budgets)
+        first = numbers("weights", weights)
+        self._budgets = numbers("budgets", budgets)
         if first.ndim != 1 or first.shape != self._budgets.shape:
             raise UsageError(
                 f"weights and budgets must have one shape (m,), got {first.shape} and {self._budgets.shape}",
@@ -197,7 +198,8 @@ class Metric:
         self.settings = settings or MetricSettings()
         with np.errstate(divide="ignore"):
             self.alpha: Array = np.log(first)
-        self._sum, self._count = np.zeros(len(first)), 0
+        self._sum = np.zeros(len(first))
+        self._count = 0
 
     @checked_arguments
     def weights(self, progress: float) -> Array:
@@ -221,7 +223,8 @@ class Metric:
         """
         if self.settings.kind != "learned":
             return
-        values, count = numbers("terms", terms), 1 + len(self.alpha)
+        values = numbers("terms", terms)
+        count = 1 + len(self.alpha)
         if values.ndim != 2 or values.shape[1] != count:
             raise UsageError(
                 f"must have shape (N, {count}), got {values.shape}", argument="terms"
@@ -229,7 +232,8 @@ class Metric:
         mean = average_loss(values[:, 1:], self.settings.average)
         # Without a valid plan the mean is nan.
         if np.isfinite(mean).all():
-            self._sum, self._count = self._sum + mean, self._count + 1
+            self._sum = self._sum + mean
+            self._count = self._count + 1
         if self.settings.every == "batch":
             self._learn(progress)
 
@@ -240,7 +244,8 @@ class Metric:
             self._learn(progress)
 
     def _learn(self, progress: float) -> None:
-        settings, count = self.settings, self._count
+        settings = self.settings
+        count = self._count
         if count and progress < settings.frozen:
             # An omitted term learns nothing.
             budgets = np.where(np.isfinite(self.alpha), self._budgets, 0.0)
@@ -258,7 +263,8 @@ class Metric:
                     alpha, np.log(settings.lowest), np.log(settings.highest)
                 )
             self.alpha = np.where(np.isfinite(self.alpha), bounded, self.alpha)
-        self._sum, self._count = np.zeros(len(self.alpha)), 0
+        self._sum = np.zeros(len(self.alpha))
+        self._count = 0
 
     def state(self) -> dict[str, Any]:
         """Return the learned state, JSON-able."""
@@ -275,11 +281,9 @@ class Metric:
         """
         try:
             values = [-np.inf if value is None else value for value in state["alpha"]]
-            alpha, total, count = (
-                np.array(values, float),
-                np.array(state["sum"], float),
-                int(state["count"]),
-            )
+            alpha = np.array(values, float)
+            total = np.array(state["sum"], float)
+            count = int(state["count"])
         except (KeyError, TypeError, ValueError) as error:
             raise UsageError(
                 f"not the state of a metric: {error}", concerns="state"
@@ -289,7 +293,9 @@ class Metric:
                 f"the state is that of a metric of {alpha.size} terms, expected {self.alpha.size}",
                 concerns="state",
             )
-        self.alpha, self._sum, self._count = alpha, total, count
+        self.alpha = alpha
+        self._sum = total
+        self._count = count
 
 
 @checked_arguments

@@ -107,7 +107,8 @@ def check_shapes(problem: Problem, shapes: Mapping[str, tuple[int, ...]]) -> Non
     Raises:
         UsageError: A shape is wrong, or the obstacle poses are missing.
     """
-    spec, width = problem.trajectory, problem.scene_width
+    spec = problem.trajectory
+    width = problem.scene_width
     if width and "obstacle_poses" not in shapes:
         names = ", ".join(box.name for box in problem.obstacle) or "a puck for each hit"
         raise UsageError(

@@ -135,8 +135,11 @@ class PlanLoss:
         check_choice("form", form, FORMS)
         check_quadrature(rule, nodes)
         check_memory("nodes", nodes, nodes)
-        self.problem, self.dtype, self.form = as_problem(problem), dtype, form
-        self.nodes, self.rule = nodes, rule
+        self.problem = as_problem(problem)
+        self.dtype = dtype
+        self.form = form
+        self.nodes = nodes
+        self.rule = rule
         self.terms = ("time", *constraint_terms(self.problem))
         self.budgets = np.array(
             [constraint.budget for constraint in self.problem.constraint]
@@ -192,7 +195,8 @@ class PlanLoss:
             UsageError: A shape is wrong, a value is not a real number, or a weight is
                 negative, infinite or of an unknown term.
         """
-        gradient, shift = flag("gradient", gradient), number("shift", shift)
+        gradient = flag("gradient", gradient)
+        shift = number("shift", shift)
         batch = check_batch(
             self.problem, path, rate, obstacle_poses, start_tip, dtype=self.dtype
         )
@@ -208,7 +212,8 @@ class PlanLoss:
         self, batch: PlanBatch, weights: AnyArray, *, shift: float, gradient: bool
     ) -> tuple[AnyArray, AnyArray, AnyArray]:
         """Return terms and gradients of a batch, block by block; the gradients are empty if they are not requested."""
-        spec, orders = self.problem.trajectory, self.problem.path_orders
+        spec = self.problem.trajectory
+        orders = self.problem.path_orders
         table = basis_table(
             spec, self.rule, self.nodes, shift, self.dtype, orders=orders
         )
@@ -219,7 +224,8 @@ class PlanLoss:
             np.empty_like(batch.rate[selected]),
         )
         # Hulls, kernel and bounds are built on first use: here, before threads start.
-        hulls, varying = self._hulls, self._varying(batch, gradient=gradient)
+        hulls = self._hulls
+        varying = self._varying(batch, gradient=gradient)
 
         def evaluate_block(rows: slice) -> None:
             part = batch[rows]
@@ -281,7 +287,8 @@ class PlanLoss:
         self, batch: PlanBatch, table: BasisTable
     ) -> tuple[AnyArray, AnyArray]:
         """Return the path, shape (orders, nodes, n, N), and the rate, shape (orders - 1, nodes, N)."""
-        nodes, orders = len(table.s), self.problem.path_orders
+        nodes = len(table.s)
+        orders = self.problem.path_orders
         points, n = batch.path.shape[1:]
         rates = batch.lanes(batch.rate)
         # Splines at all nodes by one product: rows are p, p', p'' (orders x nodes), columns
@@ -319,7 +326,8 @@ class PlanLoss:
             empty = ((points, n, 0), (batch.rate.shape[1], 0))
             by_path, by_rate = (np.empty(shape, self.dtype) for shape in empty)
             return terms, by_path, by_rate
-        by_path, by_rate = np.empty_like(path), np.empty_like(rate)
+        by_path = np.empty_like(path)
+        by_rate = np.empty_like(rate)
         self._gradient(*arguments, out=[terms, *by_path.swapaxes(1, 2), by_rate])
         # Chain rule through the splines, which are linear in the control points: the
         # transposed products.

@@ -49,11 +49,13 @@ def signals_handled(
         stay: Whether the handlers stay after the block once a signal was received;
             otherwise the previous ones are restored.
     """
-    received, before = Received(), _handlers()
+    received = Received()
+    before = _handlers()
 
     def take(number: int, _frame: FrameType | None) -> None:
         if not received.came:
-            received.number, received.since = number, time.monotonic()
+            received.number = number
+            received.since = time.monotonic()
             first(number)
         # Earlier repetitions are the same keystroke.
         elif time.monotonic() - received.since > MIN_REPEAT_INTERVAL_S:
@@ -75,7 +77,8 @@ def signals_deferred() -> Iterator[Received]:
 
     A repeated signal takes effect at once.
     """
-    before, waiting = _handlers(), Received()
+    before = _handlers()
+    waiting = Received()
 
     def effect(number: int) -> None:
         # The second signal has its usual effect at once.

@@ -78,7 +78,9 @@ class OneThread(ContextDecorator):
     """
 
     def __init__(self) -> None:
-        self._lock, self._limit, self._own = threading.Lock(), _Limit(), _OwnLimit()
+        self._lock = threading.Lock()
+        self._limit = _Limit()
+        self._own = _OwnLimit()
 
     def __enter__(self) -> None:
         shared, own = _libraries()

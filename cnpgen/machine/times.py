@@ -65,10 +65,8 @@ class Stopwatch:
 
     def prepared(self) -> None:
         """Record the end of the preparation."""
-        self.preparing, self._cpu = (
-            time.perf_counter() - self.begun,
-            time.process_time(),
-        )
+        self.preparing = time.perf_counter() - self.begun
+        self._cpu = time.process_time()
 
     def computed_here(self) -> None:
         """Record the CPU time of this process as the computing time."""

@@ -98,7 +98,8 @@ def _generated(
     """Yield the results of joblib with the backend of ``parallel_config``."""
     from joblib import Parallel, delayed
 
-    order, results = "generator" if ordered else "generator_unordered", None
+    order = "generator" if ordered else "generator_unordered"
+    results = None
     run = Parallel(
         n_jobs=workers,
         return_as=order,

@@ -64,17 +64,17 @@ class CertifiedPlan(Stage):
         )
 
     def outputs(self, context: Context) -> tuple[Field, ...]:
-        spec, joints = context.problem.trajectory, context.robot.joint_names
-        points, rates = spec.path_control_points, spec.rate_control_points
+        spec = context.problem.trajectory
+        joints = context.robot.joint_names
+        points = spec.path_control_points
+        rates = spec.rate_control_points
         path_names = tuple(
             f"C{point}.{joint}" for point in range(points) for joint in joints
         )
         rate_names = tuple(f"R{point}" for point in range(rates))
         text = f"control points of the path p(s) of a valid plan, reshape to ({points}, {len(joints)})"
-        units, rate_text = (
-            context.robot.units("rad"),
-            "control points of its rate r(s) = ds/dt",
-        )
+        units = context.robot.units("rad")
+        rate_text = "control points of its rate r(s) = ds/dt"
         return (
             Field(
                 "path_control_points",
@@ -181,13 +181,12 @@ class SceneSolver:
         guess: Motion | None = None,
     ) -> tuple[Motion, NDArray[np.bool_]]:
         """Plan N rows with columns of shape (N, width), N scenes and N initial guesses; see ``load_solver``."""
-        spec, robot, count = (
-            self._context.problem.trajectory,
-            self._context.robot,
-            len(scenes),
-        )
+        spec = self._context.problem.trajectory
+        robot = self._context.robot
+        count = len(scenes)
         path = np.empty((count, spec.path_control_points, robot.n))
-        rate, valid = np.empty((count, spec.rate_control_points)), np.zeros(count, bool)
+        rate = np.empty((count, spec.rate_control_points))
+        valid = np.zeros(count, bool)
         # Number of obstacles of each kind in each scene, shape (N, kinds).
         numbers = np.stack(
             [
@@ -208,16 +207,15 @@ class SceneSolver:
             own = {name: values[rows] for name, values in columns.items()}
             own[OBSTACLE_POSES] = scene_poses(problem.obstacle, scenes[rows])
             motion, valid[rows] = solve(own, None if guess is None else guess[rows])
-            path[rows], rate[rows] = motion.path, motion.rate
+            path[rows] = motion.path
+            rate[rows] = motion.rate
         return Motion(path, rate, spec.degree), valid
 
     def _solver(self, counts: Counts) -> tuple[Problem, Solver]:
         """Return the problem with places for some numbers of obstacles, and its solver."""
         if counts not in self._solvers:
-            context, places = (
-                self._context,
-                sample_obstacles(self._context.problem.obstacle),
-            )
+            context = self._context
+            places = sample_obstacles(self._context.problem.obstacle)
             kept = zip(OBSTACLE_KINDS, counts, strict=True)
             # The first places of each kind are kept, where scene_poses puts obstacles.
             removed = {index for kind, count in kept for index in places[kind][count:]}

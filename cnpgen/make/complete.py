@@ -114,7 +114,9 @@ def complete(
     problem = problem_of_poses(recipe)
     if problem is not None:
         poses = PoseTasks(problem)
-        fields, flat, run = poses.fields, False, partial(_completed_poses, poses)
+        fields = poses.fields
+        flat = False
+        run = partial(_completed_poses, poses)
     else:
         pipeline = (
             recipe
@@ -122,10 +124,8 @@ def complete(
             else as_dataset_recipe(recipe).pipeline
         )
         context = load_context(pipeline.problem, *choose_backend(None))
-        fields, flat = (
-            given_fields(steps_of(pipeline), context),
-            table_height(context) is not None,
-        )
+        fields = given_fields(steps_of(pipeline), context)
+        flat = table_height(context) is not None
         run = partial(_completed, pipeline, context, extrapolate)
     if table is None:
         return run(columns)
@@ -170,10 +170,8 @@ def _completed(
     )
     tasks = completion({name: rows.T for name, rows in given.items()})
     rows = {**completion.rows(tasks), "sample_id": tasks.alive.astype(np.int64)}
-    problem, source = (
-        record_problem(pipeline.problem),
-        f"tasks completed by {pipeline.name}",
-    )
+    problem = record_problem(pipeline.problem)
+    source = f"tasks completed by {pipeline.name}"
     return Completed(plans_of_rows(problem, rows, source=source), tasks.why())
 
 
@@ -215,7 +213,8 @@ def _rows(field: Field, values: ArrayLike, *, flat: bool) -> Array:
 
     On a table (``flat``) the z of a position is optional.
     """
-    array, width = numbers(field.name, values), max(field.width, 1)
+    array = numbers(field.name, values)
+    width = max(field.width, 1)
     # On a table the height follows from the problem.
     widths = {width, 2} if flat and field.name.endswith("_xyz") else {width}
     if not field.width:

@@ -66,7 +66,8 @@ def extend_dataset(
         MachineError: The backend of the dataset does not work here, the disk is full,
             or a worker died.
     """
-    where, n = Engine(engine, address, workers), integer("n", n, least=1, most=MAX_ROWS)
+    where = Engine(engine, address, workers)
+    n = integer("n", n, least=1, most=MAX_ROWS)
     folder = require_dataset(folder)
     begun = _begun(folder)
     # The recipe comes from the dataset itself: its file may have changed or be missing.

@@ -101,10 +101,8 @@ def states_of_pose(
     The shapes are (G, n) and (H, n). Robots without link geometry have no ``states`` of
     rest in a scene. ``random`` draws the seeds.
     """
-    positions, rotations = (
-        np.tile(pose.position, (POSE_SEEDS, 1)),
-        np.tile(pose.rotation, (POSE_SEEDS, 1, 1)),
-    )
+    positions = np.tile(pose.position, (POSE_SEEDS, 1))
+    rotations = np.tile(pose.rotation, (POSE_SEEDS, 1, 1))
     tolerances = [
         np.tile(np.broadcast_to(each, 3), (POSE_SEEDS, 1)) for each in pose.tolerances
     ]
@@ -183,9 +181,12 @@ class PoseTasks:
     """
 
     def __init__(self, problem: Problem) -> None:
-        self._problem, self.robot = problem, load_robot(problem)
-        joints, axes = self.robot.joint_names, ("x", "y", "z")
-        unit, start = self.robot.units("rad"), "joint positions at the start, at rest"
+        self._problem = problem
+        self.robot = load_robot(problem)
+        joints = self.robot.joint_names
+        axes = ("x", "y", "z")
+        unit = self.robot.units("rad")
+        start = "joint positions at the start, at rest"
         fields = (
             Field("start_q", unit, start, len(joints), joints),
             Field("goal_xyz", "m", "position of the tip at the goal", 3, axes),
@@ -252,10 +253,8 @@ class PoseTasks:
             np.empty((0, self.robot.n)) if isinstance(goals, str) else goals
             for goals in found
         ]
-        goal, tasks = (
-            np.concatenate(states),
-            np.repeat(np.arange(count), [len(each) for each in states]),
-        )
+        goal = np.concatenate(states)
+        tasks = np.repeat(np.arange(count), [len(each) for each in states])
         numbers = np.concatenate([np.arange(len(each), dtype=float) for each in states])
         rows: dict[str, NDArray[Any]] = {
             name: np.zeros_like(goal) for name in ("start_dq", "start_ddq", "goal_dq")
@@ -273,7 +272,8 @@ class PoseTasks:
 
     def _goals(self, task: int, given: Mapping[str, Array]) -> Array | str:
         """Return the goal states of a task, shape (G, n), or the reason why there are none."""
-        start, pose = given["start_q"][task], self._pose(task, given)
+        start = given["start_q"][task]
+        pose = self._pose(task, given)
         clear = self._states is None or self._states.are_ends(start[:, None])[0]
         if not (clear and self._conditions.met(start[:, None])[0]):
             return START_REASON

@@ -120,7 +120,9 @@ def make_dataset(
         "make_dataset", options, GenerationOptions(), old_keywords
     )
     where = Engine(chosen.engine, chosen.address, workers)
-    part, begin, model = chosen.part, chosen.begin, chosen.model
+    part = chosen.part
+    begin = chosen.begin
+    model = chosen.model
     _check(part, force=force)
     loaded = as_dataset_recipe(recipe)
     if model is not None and not certify:
@@ -301,7 +303,8 @@ def finish(
     """
     if pending(folder, spec):
         return False, []
-    has_checksum, damaged = (folder / MANIFEST).exists(), list[str]()
+    has_checksum = (folder / MANIFEST).exists()
+    damaged = list[str]()
     # A run that made nothing keeps documents that are intact, and with them their
     # bytes.
     if made == 0 and (has_checksum or exclusive):

@@ -95,7 +95,8 @@ def make_shards(
 
     The operation is idempotent.
     """
-    started, clock = _now(job), time.perf_counter()
+    started = _now(job)
+    clock = time.perf_counter()
     prepared = _prepared(job)
     for task, (columns, sampling, scenes) in zip(
         tasks, shard_columns(prepared, job.spec, tasks), strict=True
@@ -118,7 +119,8 @@ def make_shards(
             seconds=seconds,
             versions=versions(),
         )
-        started, clock = _now(job), time.perf_counter()
+        started = _now(job)
+        clock = time.perf_counter()
         yield task.rows, checked
 
 

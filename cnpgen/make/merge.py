@@ -65,7 +65,8 @@ def merge_datasets(
             f"must name at least one folder, and only folders, got {parts!r:.100}",
             argument="parts",
         )
-    out, folders = Path(out), [Path(part) for part in parts]
+    out = Path(out)
+    folders = [Path(part) for part in parts]
     spec = _common_spec(folders)
     # A part may be the output itself: its shards stay where they are.
     others = [folder for folder in folders if folder.resolve() != out.resolve()]

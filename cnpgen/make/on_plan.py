@@ -69,7 +69,8 @@ def load_stage_planner(model: str, sha256: str, context: Context) -> "Planner":
         raise RecipeError(
             [f"sha256: the file of model {model!r} has {digest}, expected {sha256}"]
         )
-    loaded, problem = load_model(model), record_problem(context.problem)
+    loaded = load_model(model)
+    problem = record_problem(context.problem)
     if loaded.problem.comparable_sha256 != problem.comparable_sha256:
         differs = ", ".join(problem.differences(loaded.problem)[:4])
         raise RecipeError(
@@ -145,11 +146,9 @@ class StartOnPlan(Stage):
     def prepare(self, context: Context) -> StageFunction:
         height = context.constraint(Table).z
         load = context.kernels.load
-        exact, tip, speed = (
-            load(onto_table, height=height),
-            load(tip_position),
-            load(velocity_of_tip),
-        )
+        exact = load(onto_table, height=height)
+        tip = load(tip_position)
+        speed = load(velocity_of_tip)
         make = self._maker(context)
 
         def work(candidates: CandidateBatch, random: np.random.Generator) -> None:
@@ -196,19 +195,22 @@ class StartOnPlan(Stage):
                 for name, values in candidates.columns.items()
             }
             motion = planner.plan_batch(planner_boundary(columns, planner)).motion
-            owner, some = np.arange(len(motion)), np.flatnonzero(refined)
+            owner = np.arange(len(motion))
+            some = np.flatnonzero(refined)
             # One plan of each group of candidates is refined; all of the group start on
             # it.
             few = some[::STATES_PER_REFINED_PLAN]
             owner[some] = np.repeat(few, STATES_PER_REFINED_PLAN)[: len(some)]
-            path, rate = motion.path.copy(), motion.rate.copy()
+            path = motion.path.copy()
+            rate = motion.rate.copy()
             with one_thread():
                 better, _ = solve(
                     {name: values[few] for name, values in columns.items()},
                     initial_guess=motion[few],
                 )
             # The motion of each candidate is then that of its owner.
-            path[few], rate[few] = better.path, better.rate
+            path[few] = better.path
+            rate[few] = better.rate
             return owner, Motion(path[owner], rate[owner], motion.degree)
 
         return make

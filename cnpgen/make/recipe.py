@@ -179,8 +179,10 @@ def restore_dataset_recipe(
     missing += missing_kinds_of_problem(pipeline_table["problem"])
     if missing:
         raise PluginError(missing)
-    path, errors = folder / "recipe.toml", list[str]()
-    content, problem = without_defaults(content), restoring_reader(urdf, path)
+    path = folder / "recipe.toml"
+    errors = list[str]()
+    content = without_defaults(content)
+    problem = restoring_reader(urdf, path)
 
     def pipeline(
         value: Any, where: RecipeLocation, errors: list[str]
@@ -213,7 +215,8 @@ def restored(spec: DatasetSpec) -> Iterator[DatasetRecipe]:
     Its URDF is in a temporary folder for the duration of the block.
     """
     # Both raise DatasetError for a specification without problem or stages.
-    urdf, _ = spec.problem.urdf, spec.stages
+    urdf = spec.problem.urdf
+    _ = spec.stages
     with (
         tempfile.TemporaryDirectory(prefix="cnpgen-") as folder,
         names_of_stored_files(Path(folder)),

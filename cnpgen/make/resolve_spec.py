@@ -170,10 +170,8 @@ def _solved_tasks(
         raise UsageError(
             f"{recipe.name} lists its tasks: they would be the same in its splits {splits}, expected one"
         )
-    tasks, requested = (
-        prepared.complete_listed_tasks(seed),
-        sum(recipe.splits.values()) if n is None else n,
-    )
+    tasks = prepared.complete_listed_tasks(seed)
+    requested = sum(recipe.splits.values()) if n is None else n
     # Only tasks that a stage completed become rows.
     rows = len(tasks.alive)
     if not rows or (n is not None and n > rows):

@@ -128,10 +128,8 @@ class SolvedScenes:
         """
         facts = Refinement(self.plans, self.plans, self.results, self.times).summary()
         for failure in facts["not_valid"]:
-            scene, explanation = (
-                self.scenes[failure["plan"]],
-                Explanation(Feasibility.UNKNOWN, POSE_EXPLANATION),
-            )
+            scene = self.scenes[failure["plan"]]
+            explanation = Explanation(Feasibility.UNKNOWN, POSE_EXPLANATION)
             if failure["reason"] != POSE_REASON:
                 explanation = self._explain(failure["plan"])
             failure |= {"scene": scene.name, "file": scene.source}
@@ -213,7 +211,9 @@ def solve_scenes(
         chosen.begin(len(scenes), 0)
     refine = _refiner(chosen, progress, options, workers=workers, discard=discard)
     capacity = capacity_of(scenes)
-    found, times, journals = dict[int, tuple[Plans, Attempt]](), NO_TIME, list[Path]()
+    found = dict[int, tuple[Plans, Attempt]]()
+    times = NO_TIME
+    journals = list[Path]()
     # Scenes of one capacity share kernels; each group has its own journal.
     for own, indices in _groups(scenes):
         file = None if journal is None else Path(f"{journal}.{len(journals)}")
@@ -239,7 +239,8 @@ def _requested(
     problem: Problem, scenes: Sequence[SceneProblem], run: SceneOptions
 ) -> tuple[Problem, Robot, list[SceneProblem]]:
     """Return the problem that scenes ask for, its robot, and the placed scenes."""
-    checked, robot = [checked_scene(scene) for scene in scenes], load_robot(problem)
+    checked = [checked_scene(scene) for scene in scenes]
+    robot = load_robot(problem)
     _check_initial(problem, len(scenes), run.initial)
     # Scenes are placed before the problem changes, since attached objects have poses in
     # frames of links.

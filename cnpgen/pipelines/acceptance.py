@@ -65,7 +65,8 @@ def acceptance(
 
     def accept(candidates: CandidateBatch, _random: np.random.Generator) -> None:
         poses = candidate_poses(context.problem, candidates)
-        start, goal = start_count(candidates, poses), goal_count(candidates, poses)
+        start = start_count(candidates, poses)
+        goal = goal_count(candidates, poses)
         # A row is unmet if it is at one of both ends; the goal may have one row more,
         # the direction of the hit.
         np.maximum(start, goal[: len(start)], out=goal[: len(start)])
@@ -82,8 +83,10 @@ def _unmet_count(
     given: Collection[End],
 ) -> Callable[[CandidateBatch, Array], Array]:
     """Return the function that counts unmet conditions of one end, a row per constraint, the tip position and a hit."""
-    exact, n = end not in given, context.robot.n
-    obstacles, constraints = context.problem.obstacle, len(context.problem.constraint)
+    exact = end not in given
+    n = context.robot.n
+    obstacles = context.problem.obstacle
+    constraints = len(context.problem.constraint)
     kernel = context.kernels.load_by_structure(
         boundary_unmet,
         end=end,
@@ -152,7 +155,8 @@ def boundary_unmet(
                     tolerance = np.maximum(along[condition.name], tolerance)
                 count = count + unmet(condition, tolerance)
         rows.append(count)
-    miss, accepted = subtract(p, state.kinematics.tip), BOUNDARY_TOLERANCES[dtype]
+    miss = subtract(p, state.kinematics.tip)
+    accepted = BOUNDARY_TOLERANCES[dtype]
     rows.append(ca.logic_not(ca.sqrt(dot(miss, miss)) <= accepted["position"]))
     hit = [ca.SX.sym("angle"), ca.SX.sym("speed")] if hitting else []
     if hit:
@@ -167,7 +171,8 @@ def _direction_unmet(
     """Build a flag that is 1 unless the tip velocity on the table is along the angle, at the speed."""
     import casadi as ca
 
-    cosine, sine = ca.cos(angle), ca.sin(angle)
+    cosine = ca.cos(angle)
+    sine = ca.sin(angle)
     # Components of the velocity across the hit, d x v, and along it, d . v.
     across = ca.fabs(cosine * velocity[1] - sine * velocity[0])
     along = cosine * velocity[0] + sine * velocity[1] - speed
@@ -299,7 +304,8 @@ def _violates(
 ) -> bool:
     """Return whether the measured form of a constraint is violated by more than the tolerance of a boundary state."""
     for condition in constraint.measured_at(world, end):
-        g, tolerance = np.array(condition.g, float), condition.tolerance(dtype)
+        g = np.array(condition.g, float)
+        tolerance = condition.tolerance(dtype)
         tolerance = (
             tolerance if exact else np.maximum(tolerance, constraint.allowed(condition))
         )

@@ -46,7 +46,8 @@ class Completion:
         steps = steps_of(pipeline)
         fields = given_fields(steps, context)
         _check(pipeline, fields, given)
-        self.context, self.given = context, {name: fields[name] for name in given}
+        self.context = context
+        self.given = {name: fields[name] for name in given}
         # Tasks have no columns of the bookkeeping fields.
         self._fields = stored_fields(steps, context)
         self.height = table_height(context)
@@ -127,23 +128,23 @@ class Completion:
 
     def _name_touching_starts(self, tasks: TaskBatch) -> None:
         """Set the reason of rejected hits whose start touches the puck, which earlier stages do not notice."""
-        problem, drawn = self.context.problem, tasks.drawn
+        problem = self.context.problem
+        drawn = tasks.drawn
         contact = problem.first(PuckContact)
         if (
             contact is None
             or not {"start_xyz", "goal_xyz", "hit_angle"} <= drawn.keys()
         ):
             return
-        start, goal, angle = (
-            drawn["start_xyz"].T,
-            drawn["goal_xyz"].T,
-            drawn["hit_angle"][0],
-        )
+        start = drawn["start_xyz"].T
+        goal = drawn["goal_xyz"].T
+        angle = drawn["hit_angle"][0]
         frame = table_frame_of(
             problem, drawn["parameters"].T if problem.parameters else None
         )
         if frame is not None:
-            start, goal = frame.to_table(start), frame.to_table(goal)
+            start = frame.to_table(start)
+            goal = frame.to_table(goal)
         # Unit velocity along the hit: only its direction determines the puck.
         direction = np.stack(
             [np.cos(angle), np.sin(angle), np.zeros(tasks.size)], axis=1

@@ -203,10 +203,8 @@ def stored_fields(steps: Sequence[PipelineStep], context: Context) -> tuple[Fiel
     errors = []
     for step in steps:
         for item in step.stage.outputs(context):
-            before, origin = (
-                fields.setdefault(item.name, item),
-                first.setdefault(item.name, step),
-            )
+            before = fields.setdefault(item.name, item)
+            origin = first.setdefault(item.name, step)
             if _definition(item) != _definition(before):
                 text = f"declares {item.name} as {_declared(item, before)}, but stage {origin.number} ({origin.kind})"
                 text += f" before it as {_declared(before, item)}: a stage may not redefine a field"
@@ -256,7 +254,8 @@ def _definition(field: Field) -> dict[str, object]:
 
 def _declared(field: Field, other: Field) -> str:
     """Return the attributes of a field that differ from another declaration of it, as text."""
-    ours, theirs = _definition(field), _definition(other)
+    ours = _definition(field)
+    theirs = _definition(other)
     return ", ".join(
         f"{key} {value!r}" for key, value in ours.items() if value != theirs[key]
     )
@@ -298,7 +297,8 @@ def prepare_steps(
 
     Raise RecipeError with all errors, each with file and stage.
     """
-    functions, errors = [], []
+    functions = []
+    errors = []
     for step in steps:
         try:
             functions.append((step.label, prepare(step.stage)))

@@ -209,12 +209,14 @@ class BlockChunk:
     """Rows ``first`` to ``stop``, exclusive, of a block, collected batch by batch, with counts of all candidates."""
 
     def __init__(self, fields: tuple[Field, ...], first: int, stop: int) -> None:
-        self.first, self.stop = first, stop
+        self.first = first
+        self.stop = stop
         self._fields = [field for field in fields if field.name not in BOOKKEEPING]
         self._parts: list[dict[str, NDArray[Any]]] = []
         self._scenes: list[SceneTable] = []
         # Candidates, and those since the last accepted one.
-        self._tried, self._waiting = 0, 0
+        self._tried = 0
+        self._waiting = 0
         self._rejections: dict[str, int] = {}
         self._stages: dict[str, str] = {}
         self._maps = [field for field in fields if field.name.endswith("_xyz")]

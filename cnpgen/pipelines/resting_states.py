@@ -38,12 +38,14 @@ class RestingStates:
                 f'the problem {problem.name!r} needs geometry = "urdf" in [robot] for collision checks in scenes',
                 concerns="problem",
             )
-        self._robot, self._data = robot, robot.model.createData()
+        self._robot = robot
+        self._data = robot.model.createData()
         self._kinematics = ForwardKinematics(robot.model)
         self._bodies = RigidBodies(
             robot.shape, len(problem.obstacle) + len(obstacles), robot.n
         )
-        clearance, own = problem.first(RobotClearance), problem.first(SelfClearance)
+        clearance = problem.first(RobotClearance)
+        own = problem.first(SelfClearance)
         self._clearance = 0.0 if clearance is None else clearance.distance
         self._self_clearance = None if own is None else own.distance
         placed = (*problem.obstacle, *obstacles)
@@ -109,5 +111,6 @@ class RestingStates:
 
 def seeds_of(robot: Robot, count: int, random: np.random.Generator) -> Array:
     """Return random joint positions within the limits [rad], shape (n, count)."""
-    low, high = robot.position_lower[:, None], robot.position_upper[:, None]
+    low = robot.position_lower[:, None]
+    high = robot.position_upper[:, None]
     return np.asarray(low + (high - low) * random.uniform(size=(robot.n, count)))

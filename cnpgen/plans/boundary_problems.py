@@ -99,10 +99,8 @@ class BoundaryFile:
     def check_shard(self) -> None:
         """Raise DatasetError for a shard that differs from its dataset's specification; see ``read_rows``."""
         if spec := self.spec():
-            folder, name = (
-                self.path.absolute().parents[1],
-                "/".join(self.path.absolute().parts[-2:]),
-            )
+            folder = self.path.absolute().parents[1]
+            name = "/".join(self.path.absolute().parts[-2:])
             for task in shards(spec):
                 # Other files in the folder are not compared with the specification.
                 if task.file == name:
@@ -397,7 +395,8 @@ def plans_of_rows(
     kept = ("start_xyz", "goal_xyz", OBSTACLE_POSES, GOAL_OPTION, *CONTEXT)
     # Rows without motions get control points of nan in the shape that the problem
     # suggests.
-    points, rates = spec.path_control_points, spec.rate_control_points
+    points = spec.path_control_points
+    rates = spec.rate_control_points
     path, rate = (
         columns.get(f"{part}_control_points", np.array(np.nan))
         for part in ("path", "rate")

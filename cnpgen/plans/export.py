@@ -111,7 +111,8 @@ def export_plans(
         text = f"the rate must be above 0 and at most {MAX_RATE_HZ:g} Hz, got {rate}"
         raise UsageError(text, concerns="rate")
     chosen = _chosen(plans, only)
-    out, refused = Path(out), _refused(plans, rate, chosen)
+    out = Path(out)
+    refused = _refused(plans, rate, chosen)
     kept = [index for index in chosen if index not in refused]
     if not kept:
         reasons = "; ".join(list(refused.values())[:3])
@@ -285,7 +286,8 @@ def _why_not(
 def _sampled(
     plans: Plans | JoinedPlans, rate: float, kept: list[int], ticks_per_s: int | None
 ) -> Iterator[SampledPlan]:
-    motion, parameters = plans.motion, _last(plans).boundary.parameters
+    motion = plans.motion
+    parameters = _last(plans).boundary.parameters
     for index in kept:
         values = () if parameters is None else tuple(parameters[index].tolist())
         # One plan at a time: samples of all plans may not fit into memory.

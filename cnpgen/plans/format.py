@@ -49,7 +49,7 @@ UNITS = {
     "jerk": "rad/s^3",
 }
 # Similarity ratio of names from which one is treated as a misspelling of the other.
-MIN_SIMILARITY = 0.8
+MIN_NAME_SIMILARITY = 0.8
 _DESCRIPTIONS = {
     "q": "joint positions",
     "dq": "joint velocities",
@@ -114,7 +114,8 @@ def plan_fields(
             fields[name] = Field(
                 name, unit, f"{text} at {goal}", len(axes), axes, frame=frame
             )
-    name, unit = "path_control_points", units_of_joints(UNITS["q"], prismatic)
+    name = "path_control_points"
+    unit = units_of_joints(UNITS["q"], prismatic)
     fields[name] = Field(name, unit, "control points of the path p(s)", names=joints)
     return fields
 
@@ -127,7 +128,7 @@ def refuse_misspelt(path: Path, names: Collection[str], asked: Collection[str]) 
     missing = [name for name in asked if name not in names]
     for name in names:
         meant = difflib.get_close_matches(
-            name.lower(), missing, n=1, cutoff=MIN_SIMILARITY
+            name.lower(), missing, n=1, cutoff=MIN_NAME_SIMILARITY
         )
         # Names with a definition of their own are no misspellings, however similar.
         if meant and name not in KNOWN:

@@ -159,7 +159,8 @@ def _parquet_schema(exported: ExportedSet) -> Any:
         "units": json.dumps(units),
         "held_joints": json.dumps(exported.held_joints),
     }
-    whole, real = pyarrow.int64(), pyarrow.float64()
+    whole = pyarrow.int64()
+    real = pyarrow.float64()
     per_joint = pyarrow.list_(real, len(exported.joint_names))
     phase = [] if exported.motion is None else [PHASE_COLUMN]
     columns = {
@@ -284,7 +285,9 @@ def _spline_columns(
     """Return the datasets of the file."""
     from scipy.interpolate import BSpline
 
-    count, points, degree = len(motion.path), motion.path.shape[1], motion.degree
+    count = len(motion.path)
+    points = motion.path.shape[1]
+    degree = motion.degree
     # A clamped knot vector repeats both ends degree + 1 times, so that the curve starts
     # and ends at control points.
     inner = np.linspace(0, 1, points - degree + 1)

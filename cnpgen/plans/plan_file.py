@@ -271,10 +271,8 @@ def stored_problem(
 def _is_beside(path: Path, problem: str) -> bool:
     """Return whether a problem is a name, or a path in the folder of the file that names it, links resolved."""
     try:
-        folder, file = (
-            os.path.realpath(path.parent),
-            os.path.realpath(path.parent / problem),
-        )
+        folder = os.path.realpath(path.parent)
+        file = os.path.realpath(path.parent / problem)
     except ValueError:  # a zero byte
         return False
     is_name = not {"/", os.sep} & set(problem) and not os.path.isfile(file)  # noqa: PTH113 - as in find_file

@@ -265,7 +265,8 @@ def make_plans(
         status=_integers("status", statuses, np.uint8),
         source=source,
     )
-    robot, boundary = open_problem(record)[1], plans.boundary
+    robot = open_problem(record)[1]
+    boundary = plans.boundary
     check_boundary_units(
         robot, boundary, argument="boundary", allow_large_angles=allow_large_angles
     )
@@ -325,7 +326,8 @@ def _integers(
         raise UsageError(
             f"must be an array of integers: {error}", argument=name
         ) from error
-    low, high = np.iinfo(kind).min, np.iinfo(kind).max
+    low = np.iinfo(kind).min
+    high = np.iinfo(kind).max
     if found.size and not (
         # astype wraps numbers that do not fit, hence the comparison with the original
         # values.
@@ -390,7 +392,8 @@ def _errors(plans: Plans, rows: int | None = None) -> Iterator[tuple[str, str]]:
             f"path_control_points must have shape (N, C, n), got {path.shape}",
         )
         return
-    rows, n = len(path) if rows is None else rows, path.shape[2]
+    rows = len(path) if rows is None else rows
+    n = path.shape[2]
     yield from _spline_errors(plans, rows)
     for name, values in plans.boundary.conditions().items():
         if values.shape != (rows, n):
@@ -412,11 +415,9 @@ def _errors(plans: Plans, rows: int | None = None) -> Iterator[tuple[str, str]]:
 
 
 def _spline_errors(plans: Plans, rows: int) -> Iterator[tuple[str, str]]:
-    path, rate, degree = (
-        plans.path_control_points,
-        plans.rate_control_points,
-        plans.degree,
-    )
+    path = plans.path_control_points
+    rate = plans.rate_control_points
+    degree = plans.degree
     _, points, n = path.shape
     if len(path) != rows:
         yield (
@@ -451,7 +452,8 @@ def _spline_errors(plans: Plans, rows: int) -> Iterator[tuple[str, str]]:
 
 
 def _parameter_errors(plans: Plans, rows: int) -> Iterator[tuple[str, str]]:
-    parameters, width = plans.boundary.parameters, len(plans.problem.parameters)
+    parameters = plans.boundary.parameters
+    width = len(plans.problem.parameters)
     if width and parameters is None:
         names = ", ".join(plans.problem.parameters.names)
         yield (

@@ -77,10 +77,12 @@ def _are_usual(robot: Robot, states: Sequence[NDArray[Any]]) -> bool:
 
 def _users_level() -> int:
     """Return the ``stacklevel`` with which a warning refers to the user's line, not to this package."""
-    level, frame = 0, inspect.currentframe()
+    level = 0
+    frame = inspect.currentframe()
     # Frames of this package and of context managers are skipped.
     while frame is not None and str(frame.f_globals.get("__name__")).partition(".")[
         0
     ] in {"cnpgen", "contextlib"}:
-        level, frame = level + 1, frame.f_back
+        level = level + 1
+        frame = frame.f_back
     return max(level, 1)

@@ -183,7 +183,8 @@ def _columns(scene: SceneProblem, robot: Robot) -> list[int]:
 
 def _within_limits(scene: SceneProblem, robot: Robot) -> Array:
     """Return the goal states of a scene, moved into the joint limits as far as their tolerances allow."""
-    request, columns = scene.request, _columns(scene, robot)
+    request = scene.request
+    columns = _columns(scene, robot)
     states = np.array(scene.goal_q, float)
     if request.goal_below is None or len(columns) != robot.n:
         return states
@@ -238,11 +239,10 @@ def joint_order(scene: SceneProblem, robot: Robot, states: Array, end: str) -> A
     violation = np.maximum(robot.position_lower - states, states - robot.position_upper)
     if violation.size and violation.max() > JOINT_TOLERANCE_RAD:
         goal, joint = np.unravel_index(violation.argmax(), violation.shape)
-        low, high = robot.position_lower[joint], robot.position_upper[joint]
-        value, unit = (
-            float(states[goal, joint]),
-            "m" if robot.prismatic[joint] else "rad",
-        )
+        low = robot.position_lower[joint]
+        high = robot.position_upper[joint]
+        value = float(states[goal, joint])
+        unit = "m" if robot.prismatic[joint] else "rad"
         raise SceneError(
             f"{scene.place}: {robot.joint_names[joint]} is {value:.4f} {unit} at the {end}, outside of its limits"
             f" [{low:.4f}, {high:.4f}] {unit}{suggested_unit(value, unit, low, high)}"
@@ -253,7 +253,8 @@ def joint_order(scene: SceneProblem, robot: Robot, states: Array, end: str) -> A
 
 def poses_of_scene(problem: Problem, fixed: int, scene: SceneProblem) -> Array:
     """Return the poses and sizes of the problem's own obstacles and those of a scene, shape (width,)."""
-    numbers, slices = place_obstacles(problem.obstacle), number_slices(problem.obstacle)
+    numbers = place_obstacles(problem.obstacle)
+    slices = number_slices(problem.obstacle)
     free: dict[str, list[int]] = {}
     for index, obstacle in enumerate(problem.obstacle[fixed:], fixed):
         free.setdefault(shape_of(obstacle), []).append(index)
@@ -262,7 +263,8 @@ def poses_of_scene(problem: Problem, fixed: int, scene: SceneProblem) -> Array:
             text = f"{scene.place} has more obstacles of the kind {obstacle.kind} than the capacity"
             raise UsageError(text, concerns="capacity")
         # The first free place of the shape: places that remain stay parked.
-        own, part = place_obstacles([obstacle]), slices[free[shape_of(obstacle)].pop(0)]
+        own = place_obstacles([obstacle])
+        part = slices[free[shape_of(obstacle)].pop(0)]
         # Places of boxes have rotation matrices, also for an obstacle that is upright.
         if obstacle.kind == "box":
             box = primitives_of([obstacle], own)
@@ -277,10 +279,8 @@ def with_wider_capacity(
     plans: Plans, problem: Problem, own: Capacity, capacity: Capacity
 ) -> Plans:
     """Return plans of a problem's own capacity with parked obstacles up to another one, so that they fit one file."""
-    before, after = (
-        with_capacity(problem, own).obstacle,
-        with_capacity(problem, capacity),
-    )
+    before = with_capacity(problem, own).obstacle
+    after = with_capacity(problem, capacity)
     poses = np.tile(place_obstacles(after.obstacle), (len(plans), 1))
     # Parked obstacles have equal names in both capacities: places are matched by name.
     positions = {

@@ -21,7 +21,8 @@ def correct_tips(plans: Plans, *, where: str = "") -> Plans:
     """
     found = {}
     for end in ("start", "goal"):
-        name, recorded = f"{end}_xyz", plans.columns[f"{end}_xyz"]
+        name = f"{end}_xyz"
+        recorded = plans.columns[f"{end}_xyz"]
         tip = plans.problem.tip_positions(getattr(plans.boundary, f"{end}_q"))
         off = np.linalg.norm(recorded - tip, axis=1)
         # Negated, so that a recorded nan counts as wrong; joints that are not finite

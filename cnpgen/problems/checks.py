@@ -123,7 +123,8 @@ class ProblemTables:
 
 def problem_errors(raw: ProblemTables) -> Iterator[str]:
     """Check conditions across tables, on the raw tables, so that all errors are reported together."""
-    table, where = raw.table, raw.where
+    table = raw.table
+    where = raw.where
     yield from _robot_errors(raw)
     yield from _repeated(raw, "constraint", "use")
     yield from _repeated(raw, "obstacle", "name")
@@ -164,7 +165,8 @@ def _robot_errors(raw: ProblemTables) -> Iterator[str]:
 
     Pinocchio checks the rest.
     """
-    joints, tip = raw.robot.get("joints"), raw.robot.get("tip")
+    joints = raw.robot.get("joints")
+    tip = raw.robot.get("tip")
     where = raw.where / "robot"
     planned: list[Any] = joints if isinstance(joints, list) else []
     path = raw.urdf_path
@@ -206,7 +208,8 @@ def _shape_errors(
     raw: ProblemTables, elements: list[ElementTree.Element]
 ) -> Iterator[str]:
     """Check a robot whose shape is that of the collision elements of its URDF."""
-    robot, where = raw.robot, raw.where / "robot"
+    robot = raw.robot
+    where = raw.where / "robot"
     if not elements:
         text = "its links have no <collision> elements, so that it has no shape"
         yield (where / "geometry").message(
@@ -235,7 +238,8 @@ def _shape_errors(
 
 def _paper_errors(raw: ProblemTables) -> Iterator[str]:
     """Check a robot with the geometry of the paper."""
-    robot, where = raw.robot, raw.where
+    robot = raw.robot
+    where = raw.where
     for place, constraint in raw.constraints("robot-clearance"):
         if "radius" not in constraint:
             text = 'missing key, expected a length [m]: with geometry = "paper-capsules" the arm is so thick'
@@ -260,7 +264,8 @@ def _paper_errors(raw: ProblemTables) -> Iterator[str]:
 
 def limit_errors(problem: Problem, raw: ProblemTables) -> Iterator[str]:
     """Check that no limit exceeds that of the URDF so far that it must be in another unit or in percent."""
-    spec, given = problem.robot, _given_limits(problem.limits)
+    spec = problem.robot
+    given = _given_limits(problem.limits)
     if raw.urdf is None:
         # Loading the robot raises the error.
         return
@@ -308,15 +313,14 @@ def _given_limits(limits: LimitSpec) -> dict[str, list[tuple[float, ...]]]:
 
 def _plausible_limit(joint: ElementTree.Element, key: str) -> tuple[float, float, str]:
     """Return the ends of the plausible range of a limit, equal where the URDF limits nothing, and the unit."""
-    limit, unit = (
-        joint.find("limit"),
-        units_of_joints(_LIMIT_UNITS[key], (joint.get("type") == "prismatic",)),
-    )
+    limit = joint.find("limit")
+    unit = units_of_joints(_LIMIT_UNITS[key], (joint.get("type") == "prismatic",))
     if key == "position":
         lower, upper = (number_in(limit, end, 0.0) for end in ("lower", "upper"))
         # The range of the URDF, widened about its center: ranges may exceed it, but not
         # as degrees exceed radians.
-        center, half = (lower + upper) / 2, MAX_RANGE_RATIO * (upper - lower) / 2
+        center = (lower + upper) / 2
+        half = MAX_RANGE_RATIO * (upper - lower) / 2
         return center - half, center + half, unit
     # Accelerations are compared with the default of the problem, a_max = rate * v_max.
     rate = LimitSpec.acceleration_rate if key == "acceleration" else 1.0
@@ -358,7 +362,8 @@ def _locked_outside(
     Mimic joints are omitted.
     """
     for joint in joints:
-        limit, name = joint.find("limit"), joint.get("name", "")
+        limit = joint.find("limit")
+        name = joint.get("name", "")
         # A mimic joint follows another joint, and continuous joints have no limits.
         movable = (
             joint.get("type") in ("revolute", "prismatic")

@@ -48,7 +48,8 @@ def measured_needs(
     far below, near and far above its limit. The world is left at rest in the base
     configuration. Boundary states have no jerk.
     """
-    robot, forms = world.robot, list(forms)
+    robot = world.robot
+    forms = list(forms)
     limits = [
         robot.velocity_limit,
         robot.acceleration_limit,
@@ -84,10 +85,8 @@ def _changed(
 
     The world is left at rest.
     """
-    obstacle_poses, rest = (
-        place_obstacles(world.obstacles),
-        [np.zeros(world.robot.n) for _ in states[0]],
-    )
+    obstacle_poses = place_obstacles(world.obstacles)
+    rest = [np.zeros(world.robot.n) for _ in states[0]]
 
     def values(dq: Array, ddq: Array, jerk: Array | None = None) -> list[Array]:
         world.set_state(world.robot.home, dq, ddq, obstacle_poses, jerk)

@@ -92,7 +92,8 @@ def load_robot(problem: Problem) -> Robot:
 def _with_shapes(problem: Problem, robot: Robot) -> Robot:
     """Return a robot with the geometry of its links and of the held object, whose sizes are checked."""
     with recipe_errors_in(problem.path):
-        model, shape = robot.model, None
+        model = robot.model
+        shape = None
         if problem.robot.geometry == "urdf":
             # Sums of matrix products, and so the last digits of capsules, would depend
             # on the number of threads.
@@ -109,7 +110,8 @@ def _with_shapes(problem: Problem, robot: Robot) -> Robot:
 
 def _attached(problem: Problem) -> Attached:
     """Return the attachments of the problem."""
-    spec, ranges = problem.robot, problem.limits.position or ()
+    spec = problem.robot
+    ranges = problem.limits.position or ()
     if ranges and len(ranges) != len(spec.joints):
         raise RecipeError(
             [
@@ -155,7 +157,8 @@ def _drive(
 
     ``torque`` has the limits at the joint before they are scaled [N m], shape (n,).
     """
-    spec, none = problem.drive, np.zeros(len(joints))
+    spec = problem.drive
+    none = np.zeros(len(joints))
     uses = spec.urdf_dynamics == "use"
     # Friction of the URDF counts only with urdf_dynamics = "use"; otherwise the factor
     # is zero.
@@ -209,7 +212,8 @@ def _given(
     if values is None:
         return np.array(otherwise)
     if len(values.values) not in (1, len(otherwise)):
-        n, found = len(otherwise), len(values.values)
+        n = len(otherwise)
+        found = len(values.values)
         raise RecipeError(
             [
                 f"{table}.{what}: needs one number, or {n}, one per planned joint, got {found}"
@@ -251,7 +255,8 @@ def _drive_errors(problem: Problem, robot: Robot) -> Iterator[str]:
     if drive is None or not drive.motor_rows:
         return
     for index, name in enumerate(robot.joint_names):
-        friction, limit = drive.resting_friction[index], drive.resting_limit[index]
+        friction = drive.resting_friction[index]
+        limit = drive.resting_limit[index]
         # At rest the motor must first exceed the dry friction.
         if friction >= limit:
             unit = unit_of(robot.units("N m"), index)
@@ -268,11 +273,9 @@ def _position_errors(problem: Problem, robot: Robot) -> Iterator[str]:
         strict=True,
     )
     for (name, low, high), sliding in zip(limits, robot.prismatic, strict=True):
-        text, largest, unit = (
-            f"{robot.urdf}: {name}: ",
-            max(low, high, key=abs),
-            "m" if sliding else "rad",
-        )
+        text = f"{robot.urdf}: {name}: "
+        largest = max(low, high, key=abs)
+        unit = "m" if sliding else "rad"
         most = PLAUSIBLE_MAX[unit]
         if low >= high:
             yield f"{text}the lower position limit must be below the upper one, got {low:g} and {high:g}"
@@ -293,7 +296,9 @@ def _weightless(robot: Robot) -> Iterator[str]:
 
 def _home_errors(problem: Problem, robot: Robot) -> Iterator[str]:
     """Yield error messages for a base configuration that is inconsistent with the joints or limits."""
-    low, high, base = robot.position_lower, robot.position_upper, robot.home
+    low = robot.position_lower
+    high = robot.position_upper
+    base = robot.home
     if base.shape != low.shape:
         yield f"{problem.path}: robot.base: needs {robot.n} values, one per planned joint, got {base.size}"
         return
@@ -347,10 +352,8 @@ def _robot_errors(robot: Robot, problem: Problem) -> Iterator[str]:
             continue
         # trace(I) = 2 * integral of r^2 dm, so that the radius of gyration is
         # sqrt(trace(I) / (2 m)).
-        center, gyration = (
-            np.linalg.norm(joint.com),
-            np.sqrt(max(np.trace(joint.inertia), 0.0) / (2 * joint.mass)),
-        )
+        center = np.linalg.norm(joint.com)
+        gyration = np.sqrt(max(np.trace(joint.inertia), 0.0) / (2 * joint.mass))
         if max(center, gyration) > MAX_CENTER_RATIO * reach:
             text = f"the center of mass is {center:.3g} m away, the radius of gyration {gyration:.3g} m"
             yield f"{name}: {text}, the arm {reach:.3g} m long; an <inertial> is in kg, m and kg m^2, not in mm or g"
@@ -418,11 +421,13 @@ def _mesh_links(urdf: str) -> set[str]:
 
 def _problem_errors(robot: Robot, problem: Problem) -> Iterator[str]:
     """Yield error messages for lengths and masses of the problem."""
-    reach, payload = robot.reach, problem.payload
+    reach = robot.reach
+    payload = problem.payload
     mass = sum(joint.mass for joint in robot.chain.joints)
     if payload is not None:
         # Masses of the chain include the payload.
-        arm, distance = mass - payload.mass, float(np.linalg.norm(payload.centre))
+        arm = mass - payload.mass
+        distance = float(np.linalg.norm(payload.centre))
         # Radius of gyration, sqrt(trace(I) / (2 m)) [m].
         gyration = float(np.sqrt(np.trace(payload.inertia_matrix) / (2 * payload.mass)))
         if arm > MIN_ARM_KG and payload.mass > MAX_PAYLOAD_RATIO * arm:

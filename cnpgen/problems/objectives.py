@@ -80,7 +80,8 @@ class Centrifugal(ObjectiveTerm):
         """Return the acceleration of the tip across its velocity, of norm kappa v^2 [m/s^2]."""
         from cnpgen.kernels.symbolic.linalg import dot
 
-        v, a = state.tip_velocity, state.tip_acceleration
+        v = state.tip_velocity
+        a = state.tip_acceleration
         # a - v (v . a) / |v|^2 is the part of a across v; the constant avoids a
         # division by zero at rest.
         along = dot(v, a) / (sum(x * x for x in v) + MIN_SQUARED_TIP_SPEED_M2_S2)
@@ -184,7 +185,8 @@ class TipReference(ObjectiveTerm):
             point = [a + fraction * d for a, d in zip(first, along, strict=True)]
             distance = sum((x - y) ** 2 for x, y in zip(tip, point, strict=True))
             if best is None:
-                best, nearest = distance, point
+                best = distance
+                nearest = point
                 continue
             # The nearest point of all segments so far, selected without branches, as SX
             # needs it.

@@ -155,7 +155,8 @@ def _parked(kind: str, index: int) -> Obstacle:
             position=PARKED_POSITION_M,
             rotation=_PARKED_ROTATION,
         )
-    name, small = f"{kind} {index}", 0.01
+    name = f"{kind} {index}"
+    small = 0.01
     if kind == "box":
         return Obstacle(
             name=name,

@@ -428,7 +428,8 @@ class Problem:
         if not self.is_stored:
             # The reader of the robot raises errors about the text itself.
             with suppress(ValueError):
-                tree, names = urdf_tree(text), spec.allow_unused
+                tree = urdf_tree(text)
+                names = spec.allow_unused
                 check_elements(tree, self.urdf_path, allow_unused=names)
         text = with_locked_joints(text, positions, is_stored=self.is_stored)
         text = with_point_masses(text)

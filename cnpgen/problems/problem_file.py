@@ -113,10 +113,8 @@ def read_problem(path: Path, errors: list[str]) -> Problem | None:
         elif undecided:
             message = f"{path}: friction of the URDF is ignored; {undecided}"
             warnings.warn(message, UserWarning, stacklevel=3)
-    spec, constraints = (
-        replace(problem.robot, geometry=raw.geometry),
-        raw.with_object_clearance(problem),
-    )
+    spec = replace(problem.robot, geometry=raw.geometry)
+    constraints = raw.with_object_clearance(problem)
     return replace(
         problem,
         path=path.absolute(),
@@ -186,7 +184,8 @@ def restore_problem(content: dict[str, Any], urdf: str, folder: Path) -> Problem
     """Rebuild a problem from its resolved form and the text of its URDF, for whose file there is a folder."""
     if missing := missing_kinds_of_problem(content):
         raise PluginError(missing)
-    path, errors = folder / "recipe.toml", list[str]()
+    path = folder / "recipe.toml"
+    errors = list[str]()
     problem: Problem | None = restoring_reader(urdf, path)(
         without_defaults(content), RecipeLocation(str(path)), errors
     )

@@ -118,16 +118,15 @@ class RobotModel:
         self.problem = as_problem(problem)
         self._robot: Robot = load_robot(self.problem)
         robot = self._robot
-        self.joint_names, self.tip, self.home = robot.joint_names, robot.tip, robot.home
-        self.position_lower, self.position_upper = (
-            robot.position_lower,
-            robot.position_upper,
-        )
-        self.velocity_limit, self.acceleration_limit = (
-            robot.velocity_limit,
-            robot.acceleration_limit,
-        )
-        self.jerk_limit, self.torque_limit = robot.jerk_limit, robot.torque_limit
+        self.joint_names = robot.joint_names
+        self.tip = robot.tip
+        self.home = robot.home
+        self.position_lower = robot.position_lower
+        self.position_upper = robot.position_upper
+        self.velocity_limit = robot.velocity_limit
+        self.acceleration_limit = robot.acceleration_limit
+        self.jerk_limit = robot.jerk_limit
+        self.torque_limit = robot.torque_limit
         self._kernels: KernelLibrary = problem_kernels(
             self.problem, robot, *choose_backend(backend)
         )
@@ -229,7 +228,8 @@ class RobotModel:
         given = {
             name: np.atleast_2d(numbers(name, xyz)) for name, xyz in vectors.items()
         }
-        start, goal = given["start_xyz"], given["goal_xyz"]
+        start = given["start_xyz"]
+        goal = given["goal_xyz"]
         for name, xyz in given.items():
             if xyz.shape != (len(start), 3):
                 raise UsageError(
@@ -324,11 +324,13 @@ class RobotModel:
     def _distance_at(self, q: Array, poses: Array) -> float:
         from cnpgen.world.world import World
 
-        problem, robot = self.problem, self._robot
+        problem = self.problem
+        robot = self._robot
         if self._world is None:
             self._world = World(robot, problem.obstacle, problem.object_size)
         # Distances depend on positions only.
-        world, rest = self._world, np.zeros(robot.n)
+        world = self._world
+        rest = np.zeros(robot.n)
         world.set_state(q, rest, rest, poses)
         distances: list[float] = []
         if robot.shape is not None:
@@ -368,7 +370,8 @@ class RobotModel:
 
     def _states(self, name: str, values: ArrayLike) -> Array:
         """Return states as kernels take them, shape (n, N)."""
-        array, n = np.atleast_2d(numbers(name, values)), len(self.joint_names)
+        array = np.atleast_2d(numbers(name, values))
+        n = len(self.joint_names)
         if array.ndim != 2 or array.shape[1] != n or not len(array):
             raise UsageError(
                 f"must have shape (N, {n}) or ({n},), got {np.shape(values)}",

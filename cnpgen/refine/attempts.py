@@ -125,11 +125,9 @@ def _with_fewer_control_points(
         coarser.spec.degree
     ):
         return
-    own, fewer, degree = (
-        refiner.check.transcription(task),
-        coarser.check.transcription(task),
-        refiner.spec.degree,
-    )
+    own = refiner.check.transcription(task)
+    fewer = coarser.check.transcription(task)
+    degree = refiner.spec.degree
     path, rate = own.unpack(x)
     fitted = with_fewer_knots(
         Motion(path[None], rate[None], degree), task.boundary, coarser.spec
@@ -272,7 +270,8 @@ def along_tree_paths(
     """
     found_path = False
     for guess in path_guesses(refiner, task):
-        found_path, attempt = True, along_path(refiner, task, guess)
+        found_path = True
+        attempt = along_path(refiner, task, guess)
         yield attempt
         # Such attempts fail by little: the strict level may close the rest.
         if attempt.violation <= MAX_JUDGED_VIOLATION:

@@ -133,11 +133,9 @@ class FineCheck:
         The result is ``(lower, upper, capsules, equal)``, see
         ``cnpgen.refine.rrt_connect.RestSpace``.
         """
-        bounds, half, capsules = (
-            self._bounds.bounds_for(task.start_xyz),
-            FINE_POINTS // 2,
-            self._bounds.capsules,
-        )
+        bounds = self._bounds.bounds_for(task.start_xyz)
+        half = FINE_POINTS // 2
+        capsules = self._bounds.capsules
         tolerances = np.where(
             capsules | self._bounds.held_clearances, 0.0, self._bounds.tolerances
         )
@@ -157,10 +155,8 @@ class FineCheck:
         """
         if not len(self._speeds):
             return 1.0
-        g, upper = (
-            self.transcription(task).measured(x)[1],
-            self._bounds.bounds_for(task.start_xyz).upper,
-        )
+        g = self.transcription(task).measured(x)[1]
+        upper = self._bounds.bounds_for(task.start_xyz).upper
         with np.errstate(divide="ignore", invalid="ignore"):
             over = np.nanmax(g[:, self._speeds] / upper[:, self._speeds], axis=0)
         return max(float(np.max(np.maximum(over, 0.0) ** (1 / self._powers))), 1.0)
@@ -176,10 +172,8 @@ class FineCheck:
         )
 
     def _end_violations(self, task: RefinementTask) -> Array:
-        bounds, motion = (
-            self._bounds.bounds_for(task.start_xyz),
-            self.transcription(task),
-        )
+        bounds = self._bounds.bounds_for(task.start_xyz)
+        motion = self.transcription(task)
         violations = bounds.end_violations(motion.end_residuals())
         return np.asarray(
             violations / np.maximum(self._bounds.tolerances, MIN_RESIDUAL_TOLERANCE)
@@ -195,7 +189,8 @@ class FineCheck:
         violations are scaled only if ``unlimited``. The result is ``(variables,
         objective, violation)`` of the scaled motion, or of the last one tried.
         """
-        total, split = 1.0, self.transcription(task).split
+        total = 1.0
+        split = self.transcription(task).split
         cost, violation = self.measure(task, x)
         for _ in range(MAX_SCALINGS):
             if (
@@ -218,7 +213,9 @@ class FineCheck:
 
 def _powers_of_rate(problem: Problem, world: World, kernels: ResidualKernels) -> Array:
     """Return the power of the rate with which every residual of velocities grows, at least 1, shape (m,)."""
-    n, orders, random = world.robot.n, problem.path_orders, np.random.default_rng(0)
+    n = world.robot.n
+    orders = problem.path_orders
+    random = np.random.default_rng(0)
     w = np.zeros((orders * n + orders - 1, 2))
     # Random p and p' at the rates 1 and 2: the ratio of the residuals is 2^power.
     w[: 2 * n] = random.uniform(0.1, 1.0, (2 * n, 1))

@@ -74,10 +74,8 @@ def first_plans(refiner: Refiner, task: RefinementTask) -> Iterator[Attempt]:
     motion = refiner.check.transcription(task)
     for guess in _guesses(refiner, task):
         path, rate = motion.unpack(guess)
-        velocity, acceleration = (
-            refiner.robot.velocity_limit,
-            refiner.robot.acceleration_limit,
-        )
+        velocity = refiner.robot.velocity_limit
+        acceleration = refiner.robot.acceleration_limit
         fast = fast_rate(path, velocity, acceleration, refiner.spec)
         x = motion.pack(path, fast if np.isfinite(fast).all() else rate)
         yield refiner.measured(task, x, Outcome.RESTARTED, unlimited=True)
@@ -89,7 +87,8 @@ def _guesses(refiner: Refiner, task: RefinementTask) -> Iterator[Array]:
         yield refiner.line_guess(task)
         yield from refiner.other_guesses(task)
         return
-    space, manifold = refiner.rest_space(task), refiner.manifold(task)
+    space = refiner.rest_space(task)
+    manifold = refiner.manifold(task)
     for states in TreeSearch(task, space, refiner.hulls, manifold).first_paths():
         yield refiner.path_guess(task, states)
 
@@ -103,7 +102,8 @@ def fast_rate(
     Path control points [rad] have shape (C, n), limits of velocities [rad/s] and
     accelerations [rad/s^2] shape (n,).
     """
-    count, degree = spec.rate_control_points, spec.degree
+    count = spec.rate_control_points
+    degree = spec.degree
     s = np.linspace(0, 1, SAMPLES_PER_CONTROL_POINT * spec.path_control_points)
     slope, curvature = (basis(s, len(path), degree, order) @ path for order in (1, 2))
     # |p' r| <= v and |p'' r^2| <= a give r <= v / |p'| and r <= sqrt(a / |p''|).
@@ -122,7 +122,8 @@ def fast_rate(
     # Large ratios of control points make r', and with it p' r r', large.
     control = np.minimum(control, MAX_RATE_RATIO * control.min())
     rate, change = (basis(s, count, degree, order) @ control for order in (0, 1))
-    speed, bend = slope * rate[:, None], curvature * rate[:, None] ** 2
+    speed = slope * rate[:, None]
+    bend = curvature * rate[:, None] ** 2
     strength = np.abs(bend + slope * (rate * change)[:, None]) / acceleration
     # r / f has f times smaller velocities and f^2 times smaller accelerations.
     # The largest excess of both kinds, so that all limits hold at the samples.

@@ -65,14 +65,16 @@ def refine_to_any(
     ``order`` are the indices of all goal states, and ``min_durations`` [s] has shape
     (G,). With ``first_valid`` the first valid motion ends the search.
     """
-    chosen, best = order[0], refine(tasks[order[0]])
+    chosen = order[0]
+    best = refine(tasks[order[0]])
     for index in order[1:]:
         # Also goals that are not finite are tried, as long as there is no valid motion.
         if best.valid and (first_valid or not min_durations[index] < best.cost):
             continue
         result = refine(tasks[index])
         if result.valid and not (best.valid and best.cost <= result.cost):
-            chosen, best = index, result
+            chosen = index
+            best = result
     return chosen, best
 
 
@@ -82,7 +84,8 @@ def order_by_tree(refiner: Refiner, tasks: Sequence[RefinementTask]) -> list[int
     Without compiled hulls, with an input plan, or in scenes that depend on the goal,
     their order is kept.
     """
-    first, kept = tasks[0], list(range(len(tasks)))
+    first = tasks[0]
+    kept = list(range(len(tasks)))
     poses = first.scene.poses
     if (
         not refiner.measures_hulls
@@ -93,7 +96,8 @@ def order_by_tree(refiner: Refiner, tasks: Sequence[RefinementTask]) -> list[int
     ):
         return kept
     goals = np.concatenate([task.boundary.goal_q for task in tasks])
-    space, manifold = refiner.rest_space(first), refiner.manifold(first)
+    space = refiner.rest_space(first)
+    manifold = refiner.manifold(first)
     search = TreeSearch(first, space, refiner.hulls, manifold, goals)
     for path in search.first_paths():
         # A path ends in one of the goals, whose difference is zero.

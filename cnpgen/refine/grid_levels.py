@@ -7,18 +7,21 @@ from cnpgen.refine.solver.bounds import Tightening
 from cnpgen.refine.solver.sqp import Settings
 
 # Phases of full tightening; contacts at the ends need the later one.
-EARLY_EDGE, LATE_EDGE = 0.012, 0.05
+EARLY_EDGE = 0.012
+LATE_EDGE = 0.05
 WARM_RADIUS = 0.1  # initial trust radius from a nearly valid plan
 # From a nearly valid plan; it saves steps there, but some other guesses fail with it.
 WARM_VIOLATION_BOUND = 1.0
 # The first steps from a plan speed it up as a whole.
 WARM_SELECTION_DISTANCES = (0.09, 1.0), (0.04, 0.3), (-1.0, 0.1)
 # From a motion along a valid joint-space path.
-PATH_VIOLATION_BOUND, PATH_PENALTY = 0.03, 1000.0
+PATH_VIOLATION_BOUND = 0.03
+PATH_PENALTY = 1000.0
 # In scaled units; with larger ones a straight line is a better initial guess.
 MAX_INITIAL_VIOLATION = 100.0
 # Factors without a plan, where small steps still lead far.
-COLD_COST_TOLERANCE, CLUTTERED_COST_TOLERANCE = 0.1, 0.05
+COLD_COST_TOLERANCE = 0.1
+CLUTTERED_COST_TOLERANCE = 0.05
 
 
 @dataclass(frozen=True)

@@ -10,12 +10,14 @@ from cnpgen.trajectory.trajectory_spec import TrajectorySpec
 from cnpgen.world.world import World
 
 # First value of a rising rate; fraction of its rising control points.
-RISING_FRACTION, RISING_PHASE = 0.3, 0.3
+RISING_FRACTION = 0.3
+RISING_PHASE = 0.3
 MIN_GUESS_DURATION_S = 0.3  # of motions between close configurations
 # Of the duration at the velocity limits, for motions along joint-space paths.
 PATH_DURATION_FACTOR = 2.0
 # States along a tip path; Gauss-Newton steps for each.
-TIP_PATH_STATES, TIP_PATH_STEPS = 24, 4
+TIP_PATH_STATES = 24
+TIP_PATH_STEPS = 4
 # Singular values below this fraction of the largest are ignored.
 TIP_PATH_CONDITION = 1e-3
 SAMPLES_PER_CONTROL_POINT = 20  # of the fit to a joint-space path
@@ -82,9 +84,11 @@ def quintic(
     rate = _constant_rate(boundary, velocity_limit, spec)
     duration = 1.0 / rate[0]
     s = np.linspace(0, 1, 4 * spec.path_control_points)
-    q0, q1 = boundary.start_q[0], boundary.goal_q[0]
+    q0 = boundary.start_q[0]
+    q1 = boundary.goal_q[0]
     # Derivatives by the phase s = t / T: dq T and ddq T^2.
-    v0, v1 = boundary.start_dq[0] * duration, boundary.goal_dq[0] * duration
+    v0 = boundary.start_dq[0] * duration
+    v1 = boundary.goal_dq[0] * duration
     a0 = boundary.start_ddq[0] * duration**2
     # Rows: value, first and second derivative of c3 s^3 + c4 s^4 + c5 s^5 at s = 1.
     constraint = np.array([[1, 1, 1], [3, 4, 5], [6, 12, 20]], float)
@@ -115,7 +119,8 @@ def fit_to_path(
     )
     s = np.linspace(0, 1, SAMPLES_PER_CONTROL_POINT * spec.path_control_points)
     q = _states_along(states, s)
-    count, n = spec.path_control_points - 3 - boundary.fixed_at_goal, states.shape[1]
+    count = spec.path_control_points - 3 - boundary.fixed_at_goal
+    n = states.shape[1]
     # The control points of the ends are known: the least squares fit has only the
     # interior ones.
     fixed = assemble(boundary, np.zeros((1, count, n)), rate[None], spec)[0]
@@ -137,7 +142,8 @@ def _states_along(states: Array, s: Array) -> Array:
     Splines have few control points. The weight w puts more of them around corners, and
     with short ramps v the middle of the path has as many of them as its ends.
     """
-    lengths, grid = _arc_lengths(states), np.linspace(0, 1, PLACING_PHASES)
+    lengths = _arc_lengths(states)
+    grid = np.linspace(0, 1, PLACING_PHASES)
     length = max(float(lengths[-1]), np.finfo(float).tiny)
     edges = np.diff(states, axis=0)
     directions = edges / np.maximum(np.diff(lengths), np.finfo(float).tiny)[:, None]
@@ -149,7 +155,8 @@ def _states_along(states: Array, s: Array) -> Array:
     ramp = np.minimum(np.minimum(grid, 1 - grid) / RAMP_PHASE, 1)
     # Smoothstep: its slope is zero at both ends of the ramp.
     speed = ramp**2 * (3 - 2 * ramp)
-    weights, distance = _integral(weight), _integral(speed)
+    weights = _integral(weight)
+    distance = _integral(speed)
     along = np.interp(np.interp(s, grid, distance), weights, grid)
     return np.stack(
         [np.interp(along * length, lengths, joint) for joint in states.T], axis=1
@@ -170,7 +177,8 @@ def along_tip_path(
     They result from Gauss-Newton steps of minimum norm from the joint-space line; the
     world is moved.
     """
-    lengths, rest = _arc_lengths(tip_path), np.zeros(len(start_q))
+    lengths = _arc_lengths(tip_path)
+    rest = np.zeros(len(start_q))
     along = np.linspace(0, 1, TIP_PATH_STATES)
     tips = np.stack(
         [np.interp(along * lengths[-1], lengths, values) for values in tip_path.T],

@@ -58,10 +58,8 @@ def refine_groups(
 
     results = list[tuple[int, Attempt]]()
     for rows in groups:
-        goals, first_valid = (
-            [tasks[row] for row in rows],
-            options.time_limit is not None,
-        )
+        goals = [tasks[row] for row in rows]
+        first_valid = options.time_limit is not None
         index, result = refine_to_any(
             goals,
             refine,
@@ -100,10 +98,8 @@ def load_solver(problem: Problem, robot: Robot, kernels: KernelLibrary) -> Solve
         returns N motions and the mask of those that the verdict accepts, (N,).
     """
     refiner = Refiner(problem, robot, kernels=kernels)
-    checker, spec = (
-        PlanChecker(problem, robot, degree=refiner.spec.degree),
-        refiner.spec,
-    )
+    checker = PlanChecker(problem, robot, degree=refiner.spec.degree)
+    spec = refiner.spec
 
     def solve(
         columns: Mapping[str, Array], initial_guess: Motion | None = None

@@ -140,7 +140,8 @@ def refine_tasks(
     to_any_goal: bool = True,
 ) -> Refinement:
     """Refine plans as ``refine_plans`` does, and ``to_any_goal`` of a task as ``solve_plans`` does."""
-    watch, plans = Stopwatch(), correct_tips(plans)
+    watch = Stopwatch()
+    plans = correct_tips(plans)
     several = to_any_goal and GOAL_OPTION in plans.columns
     groups = goal_groups(plans) if several else [[row] for row in range(len(plans))]
     identity = identity_of_run(plans, options, tasks=len(groups))
@@ -221,7 +222,8 @@ def _refine(
     Return the row of each result, the results and the CPU time [s].
     """
     (part, plans), begun = task, time.thread_time()
-    rows, places = np.concatenate(part), iter(range(len(plans)))
+    rows = np.concatenate(part)
+    places = iter(range(len(plans)))
     # Their places among the plans that were sent.
     groups = [[next(places) for _ in group] for group in part]
     with one_thread():

@@ -48,16 +48,20 @@ PROJECTED_FRACTION = 0.05  # of its tolerance, at which an equality is met
 # Of small trees in turn, added to the required distances.
 TREE_MARGINS_M = 6e-3, 3e-3, 1e-3, 0.0
 SMALL_TREES, SMALL_TREE_EXTENSIONS = 12, 4_000  # four, if these find too few paths
-MIN_TREE_PATHS, MAX_TREE_PATHS = 3, 8
+MIN_TREE_PATHS = 3
+MAX_TREE_PATHS = 8
 LARGE_TREE_EXTENSIONS = 128_000  # without margin, in narrow passages
 # With edges of either length; three if no tree connects.
-LARGE_TREES, MAX_UNCONNECTED_TREES = 12, 3
+LARGE_TREES = 12
+MAX_UNCONNECTED_TREES = 3
 # Length of an edge [rad or m]; shorter ones after the others.
-TREE_EXTENSION_RAD, SHORT_TREE_EXTENSION_RAD = 1.0, 0.5
+TREE_EXTENSION_RAD = 1.0
+SHORT_TREE_EXTENSION_RAD = 0.5
 TREE_SHORTCUTS = 400  # attempted on a path
 # Of projected states, which are all nodes, so that trees have more of them.
 MANIFOLD_SPACING_RAD = 0.04
-MANIFOLD_NODES, MANIFOLD_LARGE_TREE_NODES = 6_000, 24_000
+MANIFOLD_NODES = 6_000
+MANIFOLD_LARGE_TREE_NODES = 24_000
 
 
 @dataclass(frozen=True)
@@ -105,7 +109,8 @@ class RestSpace:
 
     def _count_valid(self, q: Array) -> int:
         """Return the number of leading valid states."""
-        met, poses = self._met(q), self.scene_poses
+        met = self._met(q)
+        poses = self.scene_poses
         if self.hulls is None:
             return _first(~np.logical_and.reduce(met))
         # Cheap conditions first: each one only checks the states before the first
@@ -128,12 +133,12 @@ class RestSpace:
 
         Joints that reach a limit stay there.
         """
-        low, high = (
-            self.robot.position_lower[:, None],
-            self.robot.position_upper[:, None],
-        )
-        q, rows = np.clip(q, low, high), self.equal
-        lower, upper = self.lower[rows, None], self.upper[rows, None]
+        low = self.robot.position_lower[:, None]
+        high = self.robot.position_upper[:, None]
+        q = np.clip(q, low, high)
+        rows = self.equal
+        lower = self.lower[rows, None]
+        upper = self.upper[rows, None]
         for _ in range(MAX_PROJECTIONS):
             g, columns = self.kernels.jacobian(*self._arguments(q))
             # Bounds of equalities are relaxed by their tolerances; the middle is the
@@ -165,9 +170,11 @@ class RestSpace:
     def _arguments(self, q: Array) -> tuple[Array, Array]:
         """Return the kernel arguments of K states at rest."""
         (n, count), width = q.shape, self.kernels.values.tape.inputs[0]
-        w, orders = np.zeros((width, count)), (width + 1) // (n + 1)
+        w = np.zeros((width, count))
+        orders = (width + 1) // (n + 1)
         # Positions and the rate.
-        w[:n], w[orders * n] = q, 1.0
+        w[:n] = q
+        w[orders * n] = 1.0
         return w, np.repeat(self.kernel_poses[:, None], count, axis=1)
 
 
@@ -180,7 +187,9 @@ class _Tree:
     """Tree of configurations that are connected with one end: nodes (n,), their parents, and states (k, n) of edges."""
 
     def __init__(self, root: Array) -> None:
-        self.nodes, self.parents, self.states = [root], [-1], [root[None]]
+        self.nodes = [root]
+        self.parents = [-1]
+        self.states = [root[None]]
 
     def grow(self, target: Array, follow: Follow, max_extension: float) -> bool:
         """Extend the nearest node towards a configuration while states are valid.
@@ -205,7 +214,8 @@ class _Tree:
 
     def path(self) -> Array:
         """Return the states from the root to the last node, shape (K, n)."""
-        edges, index = list[Array](), len(self.nodes) - 1
+        edges = list[Array]()
+        index = len(self.nodes) - 1
         while index >= 0:
             edges.append(self.states[index])
             index = self.parents[index]
@@ -219,7 +229,8 @@ def follow_line(begin: Array, end: Array, follow: Follow) -> tuple[Array, bool]:
     ``RestSpace.follow`` for the leading valid states.
     """
     count = max(int(np.ceil(np.abs(end - begin).max() / STATE_SPACING)), 1)
-    fractions, states = np.arange(1, count + 1) / count, begin[:, None]
+    fractions = np.arange(1, count + 1) / count
+    states = begin[:, None]
     for first in range(0, count, STATES_PER_CHECK):
         block = fractions[first : first + STATES_PER_CHECK]
         valid = follow(begin[:, None] + (end - begin)[:, None] * block)
@@ -259,12 +270,14 @@ def find_path(
 
     The arguments are those of ``find_paths``, and the seed of the random numbers.
     """
-    random, trees = np.random.default_rng(seed), (_Tree(start), _Tree(goal))
+    random = np.random.default_rng(seed)
+    trees = (_Tree(start), _Tree(goal))
     # Joints with wide ranges are sampled near both ends only.
     lower = np.maximum(robot.position_lower, np.minimum(start, goal) - MAX_TURN)
     upper = np.minimum(robot.position_upper, np.maximum(start, goal) + MAX_TURN)
     for extension in range(MAX_EXTENSIONS):
-        tree, other = trees[extension % 2], trees[1 - extension % 2]
+        tree = trees[extension % 2]
+        other = trees[1 - extension % 2]
         before = len(tree.nodes)
         tree.grow(random.uniform(lower, upper), follow, MAX_EXTENSION)
         # Connect: the other tree grows as far as the new node.
@@ -312,7 +325,8 @@ class TreeSearch:
         all conditions at rest come first, and then those of shorter estimated duration.
         Paths of large trees with shorter edges follow.
         """
-        found, seeds = list[Array](), count()
+        found = list[Array]()
+        seeds = count()
         line = self.line()
         if line is not None:
             yield line
@@ -323,7 +337,8 @@ class TreeSearch:
         found += islice(
             self._large_trees(seeds, TREE_EXTENSION_RAD, bool(found)), missing
         )
-        space, limit = self.space, self.space.robot.velocity_limit
+        space = self.space
+        limit = self.space.robot.velocity_limit
         # Paths that meet all other conditions come first, then the fastest.
         durations = [
             (not space.meets_other_conditions(path), estimated_duration(path, limit))
@@ -388,13 +403,12 @@ class TreeSearch:
                 else MANIFOLD_NODES
             )
             settings = replace(settings, spacing=MANIFOLD_SPACING_RAD, max_nodes=nodes)
-        task, robot = self.task, self.space.robot
+        task = self.task
+        robot = self.space.robot
         start = task.boundary.start_q[0]
         goals = task.boundary.goal_q if self.goals is None else self.goals
-        lower, upper = (
-            np.minimum(start, goals.min(axis=0)) - MAX_TURN,
-            np.maximum(start, goals.max(axis=0)) + MAX_TURN,
-        )
+        lower = np.minimum(start, goals.min(axis=0)) - MAX_TURN
+        upper = np.maximum(start, goals.max(axis=0)) + MAX_TURN
         box = (
             np.maximum(robot.position_lower, lower),
             np.minimum(robot.position_upper, upper),

@@ -70,7 +70,8 @@ def refine_task(
     """
     if not task.is_finite:
         return _invalid_input(refiner, task)
-    search, x = RefinementSearch(refiner, checker, task), refiner.input_variables(task)
+    search = RefinementSearch(refiner, checker, task)
+    x = refiner.input_variables(task)
     for attempt in make_attempts(refiner, task, x):
         if (
             search.add(attempt)
@@ -114,7 +115,8 @@ def refine_task_until(
     until = time.perf_counter() + seconds
     if not task.is_finite:
         return _invalid_input(refiner, task)
-    search, x = RefinementSearch(refiner, checker, task), refiner.input_variables(task)
+    search = RefinementSearch(refiner, checker, task)
+    x = refiner.input_variables(task)
     # The last verdict must fit before the deadline, so that its time is reserved.
     verdicts = Deadline(until, max_duration=VERDICT_TIME_S)
     best: Attempt | None = None
@@ -184,7 +186,8 @@ def _is_input(task: RefinementTask, path: Array, rate: Array) -> bool:
 
 def _invalid_input(refiner: Refiner, task: RefinementTask) -> Attempt:
     """Return the input plan, or nan, for boundary conditions that are not finite."""
-    spec, n = refiner.spec, task.boundary.start_q.shape[1]
+    spec = refiner.spec
+    n = task.boundary.start_q.shape[1]
     path = (
         np.full((spec.path_control_points, n), np.nan)
         if task.path is None
@@ -208,7 +211,9 @@ class PlanChecker:
     """Independent check of the plans of a problem, splines of one degree."""
 
     def __init__(self, problem: Problem, robot: Robot, *, degree: int) -> None:
-        self._problem, self._robot, self._degree = problem, robot, degree
+        self._problem = problem
+        self._robot = robot
+        self._degree = degree
 
     def verdict(self, task: RefinementTask, path: Array, rate: Array) -> Verdict:
         """Judge path control points (C, n) and rate control points (R,) as a plan of the task, with early exit."""

@@ -183,7 +183,8 @@ class Attempt:
     def is_better(self, other: Attempt) -> bool:
         """Return whether the violation is smaller than another's, or as small at a lower cost."""
         # Violations up to 1 are within the tolerances and count as equal.
-        mine, others = max(self.violation, 1.0), max(other.violation, 1.0)
+        mine = max(self.violation, 1.0)
+        others = max(other.violation, 1.0)
         return self.cost < other.cost if mine == others else mine < others
 
     def result(self, iterations: int, outcome: Outcome | None = None) -> Attempt:

@@ -60,7 +60,8 @@ def with_attached_link(
     Raises:
         RecipeError: The URDF has a link or a joint of that name.
     """
-    robot, body = urdf_tree(urdf), attached_link_name(name)
+    robot = urdf_tree(urdf)
+    body = attached_link_name(name)
     element = Element("link", name=body)
     if any(part.get("name") == body for part in robot if part.tag in {"link", "joint"}):
         raise RecipeError([f"the URDF has a link or joint {body!r} already"])
@@ -69,7 +70,8 @@ def with_attached_link(
     for kind in ("visual", "collision"):
         for shape in shapes:
             part = SubElement(element, kind)
-            xyz, rpy = numbers_text(shape.position or ()), numbers_text(shape.rotation)
+            xyz = numbers_text(shape.position or ())
+            rpy = numbers_text(shape.rotation)
             SubElement(part, "origin", xyz=xyz, rpy=rpy)
             SubElement(part, "geometry").append(_geometry(shape))
     return _with_link(robot, element, link, dict.fromkeys((link, *touch_links)))
@@ -142,7 +144,8 @@ def uniform_inertia(shapes: Sequence[Obstacle], mass: float) -> pin.Inertia:
 
     bodies = [_coal_shape(shape) for shape in shapes]
     volumes = np.array([body.computeVolume() for body in bodies])
-    density, total = mass / volumes.sum(), pin.Inertia.Zero()
+    density = mass / volumes.sum()
+    total = pin.Inertia.Zero()
     for shape, body, volume in zip(shapes, bodies, volumes, strict=True):
         # Coal returns the inertia at unit density, about the center of mass
         inertia = density * np.array(body.computeMomentofInertiaRelatedToCOM())

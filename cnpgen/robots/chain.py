@@ -88,7 +88,8 @@ def chain_from_model(model: "pin.Model", tip: str) -> Chain:
     """
     data = model.createData()
     for index in range(1, model.njoints):
-        name, joint = model.names[index], model.joints[index]
+        name = model.names[index]
+        joint = model.joints[index]
         if joint.nq != 1 or joint.nv != 1:
             raise RecipeError(
                 [f"robot.joints: {name!r} is {_kind(joint.shortname())}: {_PLANNED}"]
@@ -149,7 +150,8 @@ def _kind(name: str) -> str:
 
 
 def _joint(model: "pin.Model", data: "pin.Data", index: int) -> Joint:
-    placement, inertia = model.jointPlacements[index], model.inertias[index]
+    placement = model.jointPlacements[index]
+    inertia = model.inertias[index]
     # The angular part of the motion subspace is zero for a joint that slides.
     subspace = np.asarray(data.joints[index].S, float).ravel()  # (linear, angular)
     prismatic = bool(np.abs(subspace[3:]).max() < 0.5)

@@ -216,7 +216,8 @@ class ParameterRanges:
         spans = {}
         for name, span, values in zip(self.names, self.ranges, rows.T, strict=True):
             finite = values[np.isfinite(values)].tolist()
-            low, high = min(finite, default=span.low), max(finite, default=span.high)
+            low = min(finite, default=span.low)
+            high = max(finite, default=span.high)
             key = declared[name]
             # A range is widened up to the bounds of its key only.
             least = -np.inf if key.low is None else key.low

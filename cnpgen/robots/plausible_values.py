@@ -91,10 +91,12 @@ def _plausible_range(robot: Robot, name: str, unit: str) -> tuple[Any, Any]:
     # The quantity is the last part of a name: "start_q" -> "q".
     quantity = name.rpartition("_")[2]
     if quantity == "q":
-        low, high = robot.position_lower, robot.position_upper
+        low = robot.position_lower
+        high = robot.position_upper
         # A joint without limits has the center nan and an infinite half range.
         with np.errstate(invalid="ignore"):
-            center, half = (low + high) / 2, MAX_RANGE_RATIO * (high - low) / 2
+            center = (low + high) / 2
+            half = MAX_RANGE_RATIO * (high - low) / 2
         bounded = np.isfinite(half)
         return np.where(bounded, center - half, -np.inf), np.where(
             bounded, center + half, np.inf

@@ -181,7 +181,8 @@ class Robot:
         """Compute tip positions with Pinocchio [m], shape (N, 3), from joint positions [rad], shape (N, n)."""
         import pinocchio as pin
 
-        data, positions = self.model.createData(), np.empty((len(q), 3))
+        data = self.model.createData()
+        positions = np.empty((len(q), 3))
         for row, configuration in enumerate(q):
             pin.forwardKinematics(self.model, data, configuration)
             positions[row] = pin.updateFramePlacement(
@@ -290,14 +291,16 @@ def _narrow_to_soft_limits(
             continue
         place = model.idx_qs[model.getJointId(joint.name)]
         hard = model.lowerPositionLimit[place], model.upperPositionLimit[place]
-        low, high = max(hard[0], joint.soft[0]), min(hard[1], joint.soft[1])
+        low = max(hard[0], joint.soft[0])
+        high = min(hard[1], joint.soft[1])
         if low >= high:
             soft = f"[{joint.soft[0]:g}, {joint.soft[1]:g}]"
             text = f"joint {joint.name!r}: its soft limits {soft} leave nothing of its limits"
             errors.append(
                 f'{text} [{hard[0]:g}, {hard[1]:g}]; [limits] soft = "ignore" drops them'
             )
-        model.lowerPositionLimit[place], model.upperPositionLimit[place] = low, high
+        model.lowerPositionLimit[place] = low
+        model.upperPositionLimit[place] = high
     if errors:
         raise RecipeError(errors)
 
@@ -308,7 +311,8 @@ def _mimic_errors(tree: ElementTree.Element, planned: Sequence[str]) -> Iterator
         mimic = joint.find("mimic")
         if mimic is None:
             continue
-        name, other = joint.get("name", ""), mimic.get("joint", "")
+        name = joint.get("name", "")
+        other = mimic.get("joint", "")
         if name in planned:
             yield f"{name!r} mimics {other!r} and cannot be planned by itself; mimic joints are not supported"
         elif other in planned:
@@ -358,7 +362,8 @@ def _capsule_axes(model: "pin.Model", tip: str) -> tuple[tuple[int, int], ...]:
     """
     import pinocchio as pin
 
-    data, random = model.createData(), np.random.default_rng(0)
+    data = model.createData()
+    random = np.random.default_rng(0)
     poses = []
     for _ in range(4):
         q = random.uniform(model.lowerPositionLimit, model.upperPositionLimit)
@@ -372,7 +377,8 @@ def _capsule_axes(model: "pin.Model", tip: str) -> tuple[tuple[int, int], ...]:
         return bool(np.ptp(points[:, a], axis=0).max() < 1e-9)
 
     def straight(a: int, b: int, c: int) -> bool:
-        first, second = points[:, b] - points[:, a], points[:, c] - points[:, b]
+        first = points[:, b] - points[:, a]
+        second = points[:, c] - points[:, b]
         # A link that folds back is a separate segment.
         onwards = bool((first * second).sum(axis=1).min() > 0)
         # Both parts lie on one line where their cross product vanishes.
@@ -419,7 +425,8 @@ def attach(model: "pin.Model", attached: Attached) -> None:
         model.appendBodyToJoint(frame.parentJoint, inertia, placement)
     for name, (low, high) in attached.ranges.items():
         place = model.idx_qs[model.getJointId(name)]
-        model.lowerPositionLimit[place], model.upperPositionLimit[place] = low, high
+        model.lowerPositionLimit[place] = low
+        model.upperPositionLimit[place] = high
 
 
 def bounded(urdf: str, tree: ElementTree.Element, attached: Attached) -> str:

@@ -240,10 +240,8 @@ class Payload:
 
     def at(self, parameters: Mapping[str, float]) -> Payload:
         """Return the payload of a sample, from its parameters by name."""
-        mass, factor = (
-            parameters.get("payload_mass", self.mass),
-            parameters.get("payload_inertia", 1.0),
-        )
+        mass = parameters.get("payload_mass", self.mass)
+        factor = parameters.get("payload_inertia", 1.0)
         x, y, z = (
             parameters.get(name, value)
             for name, value in zip(PAYLOAD_CENTRE, self.centre, strict=True)

@@ -204,8 +204,10 @@ def make_scene_table(
 def _quaternions(rotation: Array) -> Array:
     """Return the quaternions (w, x, y, z) of roll, pitch and yaw about fixed axes [rad], shape (M, 3) -> (M, 4)."""
     (cr, cp, cy), (sr, sp, sy) = np.cos(rotation.T / 2), np.sin(rotation.T / 2)
-    w, x = cr * cp * cy + sr * sp * sy, sr * cp * cy - cr * sp * sy
-    y, z = cr * sp * cy + sr * cp * sy, cr * cp * sy - sr * sp * cy
+    w = cr * cp * cy + sr * sp * sy
+    x = sr * cp * cy - cr * sp * sy
+    y = cr * sp * cy + sr * cp * sy
+    z = cr * cp * sy - sr * sp * cy
     return np.stack([w, x, y, z], axis=1)
 
 
@@ -235,11 +237,10 @@ def scene_poses(obstacles: Sequence[Obstacle], table: SceneTable) -> Array:
     order; the others stay parked.
     """
     poses = np.tile(place_obstacles(obstacles), (len(table), 1))
-    slices, rotations = number_slices(obstacles), rotations_of(table)
-    position, size = (
-        table.obstacle_position.astype(np.float64),
-        table.obstacle_size.astype(np.float64),
-    )
+    slices = number_slices(obstacles)
+    rotations = rotations_of(table)
+    position = table.obstacle_position.astype(np.float64)
+    size = table.obstacle_size.astype(np.float64)
     for code, (kind, places) in enumerate(sample_obstacles(obstacles).items()):
         scenes, entries = np.nonzero(table.obstacle_kind == code)
         rank = np.cumsum(table.obstacle_kind == code, axis=1)[scenes, entries] - 1

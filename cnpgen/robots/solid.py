@@ -153,7 +153,8 @@ def posed_numbers(kind: str, position: Array, size: Array, rotation: Array) -> A
     Positions and sizes (edge lengths, or radius and length) [m] have shape (M, 3),
     rotations (M, 3, 3).
     """
-    turn, radius = rotation.reshape(-1, 9), size[:, :1]
+    turn = rotation.reshape(-1, 9)
+    radius = size[:, :1]
     if kind == "box":
         return np.concatenate([position, size / 2, turn], axis=1)
     if kind == "mesh":
@@ -182,7 +183,8 @@ def _solid(obstacle: Obstacle, numbers: Array) -> Solid:
     """
     if obstacle.upright:
         return _upright_box(obstacle, float(numbers[0]))
-    position, rest = numbers[:3], numbers[3:]
+    position = numbers[:3]
+    rest = numbers[3:]
     if obstacle.kind == "box":
         corners = 2 * CUBE * rest[:3]
         return _wrapped(
@@ -202,15 +204,14 @@ def _solid(obstacle: Obstacle, numbers: Array) -> Solid:
 
 
 def _wrapped(position: Array, corners: Array, radius: float = 0.0) -> Solid:
-    low, high = (
-        position + corners.min(axis=0) - radius,
-        position + corners.max(axis=0) + radius,
-    )
+    low = position + corners.min(axis=0) - radius
+    high = position + corners.max(axis=0) + radius
     return Solid(position, corners, low, high, radius)
 
 
 def _upright_box(obstacle: Obstacle, top: float) -> Box:
-    x, y = obstacle.x or Range(0, 0), obstacle.y or Range(0, 0)
+    x = obstacle.x or Range(0, 0)
+    y = obstacle.y or Range(0, 0)
     height = obstacle.height or UNBOUNDED_OBSTACLE_HEIGHT_M
     center = np.array([(x.low + x.high) / 2, (y.low + y.high) / 2, top - height / 2])
     corners = CUBE * np.array([x.high - x.low, y.high - y.low, height])

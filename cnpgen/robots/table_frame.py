@@ -60,10 +60,8 @@ def table_frame(ranges: ParameterRanges, pivot: Array, parameters: Array) -> Tab
 
 def upright_axes(ranges: ParameterRanges, parameters: Array) -> Array:
     """Return the axes that turn with the upright direction of N samples, one per row, shape (N, 3, 3)."""
-    columns, zero = (
-        dict(zip(ranges.names, parameters.T, strict=True)),
-        np.zeros(len(parameters)),
-    )
+    columns = dict(zip(ranges.names, parameters.T, strict=True))
+    zero = np.zeros(len(parameters))
     return turned_axes(*(columns.get(name, zero) for name in UPRIGHT_TURN))
 
 
@@ -98,7 +96,8 @@ def moved_box(
         0.0 if span is None else max(abs(span.low), abs(span.high))
         for span in (ranges.table_roll, ranges.table_pitch)
     )
-    identity, reach = np.eye(3), np.maximum(np.abs(low - pivot), np.abs(high - pivot))
+    identity = np.eye(3)
+    reach = np.maximum(np.abs(low - pivot), np.abs(high - pivot))
     deviation = np.abs(
         np.array(table_axes(np.sin(roll), np.cos(roll), np.sin(pitch), np.cos(pitch))).T
         - identity

@@ -91,12 +91,12 @@ def urdf_tree(text: str) -> ElementTree.Element:
 
 def _tree_without_namespaces(text: str) -> ElementTree.Element:
     """Parse the text of a URDF with undeclared prefixes, such as those of Gazebo, as other URDF parsers do."""
-    parser, builder = ParserCreate("utf-8"), _Builder()
-    parser.StartElementHandler, parser.EndElementHandler = builder.start, builder.end
-    parser.CharacterDataHandler, parser.StartDoctypeDeclHandler = (
-        builder.data,
-        builder.doctype,
-    )
+    parser = ParserCreate("utf-8")
+    builder = _Builder()
+    parser.StartElementHandler = builder.start
+    parser.EndElementHandler = builder.end
+    parser.CharacterDataHandler = builder.data
+    parser.StartDoctypeDeclHandler = builder.doctype
     try:
         parser.Parse(text.encode(), True)
     except ExpatError as error:

@@ -15,10 +15,12 @@ from cnpgen.robots.urdf import number_in, numbers_in, numbers_text, read_urdf, u
 from cnpgen.robots.urdf_elements import check_elements
 from cnpgen.robots.urdf_parameters import placement_of
 
-_TURNING, _SLIDING = ("revolute", "continuous"), ("prismatic",)
+_TURNING = ("revolute", "continuous")
+_SLIDING = ("prismatic",)
 # Elements of a joint that moves.
 _MOTION = "axis", "limit", "mimic", "calibration", "dynamics", "safety_controller"
-_TAG, _PAIR = "disable_collisions", ("link1", "link2")
+_TAG = "disable_collisions"
+_PAIR = ("link1", "link2")
 _NO_DEFAULT = "disable_default_collisions"
 # The problem names the planned joints, the tip and the placement of the base; pairs are
 # checked unless they are disabled, which takes precedence over <enable_collisions>.
@@ -79,10 +81,8 @@ def _mimicking(
             and mimic.get("joint") in positions
             and name not in positions
         ):
-            factor, offset = (
-                number_in(mimic, "multiplier", 1.0),
-                number_in(mimic, "offset", 0.0),
-            )
+            factor = number_in(mimic, "multiplier", 1.0)
+            offset = number_in(mimic, "offset", 0.0)
             found[name] = factor * positions[mimic.get("joint", "")] + offset
     return found
 
@@ -163,10 +163,12 @@ def with_collision_geometry(
     Raises:
         RecipeError: There is no such link.
     """
-    visual, skipped = tuple(visual), tuple(skipped)
+    visual = tuple(visual)
+    skipped = tuple(skipped)
     if not visual and not skipped:
         return urdf
-    robot, errors = urdf_tree(urdf), list[str]()
+    robot = urdf_tree(urdf)
+    errors = list[str]()
     links = {link.get("name", ""): link for link in robot.findall("link")}
     for key, names in {"visual_links": visual, "skipped_meshes": skipped}.items():
         errors += [

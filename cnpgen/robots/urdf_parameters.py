@@ -132,9 +132,11 @@ def _links_in_cycles(joints: Mapping[str, UrdfJoint]) -> list[str]:
 
     The parser ignores cycles that no root moves.
     """
-    rooted, found = set[str](), list[str]()
+    rooted = set[str]()
+    found = list[str]()
     for first in joints:
-        link, path = first, set[str]()
+        link = first
+        path = set[str]()
         while link in joints and link not in rooted and link not in path:
             path.add(link)
             link = joints[link].parent
@@ -177,7 +179,8 @@ def _inertia(link: Element) -> LinkInertia | None:
     element = link.find("inertial")
     if element is None:
         return None
-    mass, tensor = element.find("mass"), element.find("inertia")
+    mass = element.find("mass")
+    tensor = element.find("inertia")
     if mass is None or mass.get("value") is None:
         raise ValueError("its <inertial> has no <mass value=...>")
     if tensor is not None and (
@@ -300,7 +303,8 @@ class _Comparison:
     """Comparison of one model with the parameters of its URDF."""
 
     def __init__(self, model: "pin.Model", parameters: UrdfParameters) -> None:
-        self.model, self.parameters = model, parameters
+        self.model = model
+        self.parameters = parameters
         self.joints = {
             name: index for index, name in enumerate(model.names) if index != WORLD
         }
@@ -319,7 +323,8 @@ class _Comparison:
             joint = self.parameters.joints[link]
             if joint.name in self.joints:
                 return self.joints[joint.name], inner
-            inner, link = joint.origin.of(inner), joint.parent
+            inner = joint.origin.of(inner)
+            link = joint.parent
         return WORLD, inner
 
     def errors(self) -> Iterator[str]:
@@ -333,7 +338,8 @@ class _Comparison:
 
     def _of_joint(self, joint: UrdfJoint) -> Iterator[str]:
         """Compare placement, axis and limits of a joint."""
-        model, index = self.model, self.joints[joint.name]
+        model = self.model
+        index = self.joints[joint.name]
         parent, placement = self.bodies.get(joint.parent, (WORLD, IDENTITY))
         actual = model.jointPlacements[index]
         if model.parents[index] != parent or not _same_placement(
@@ -348,7 +354,8 @@ class _Comparison:
         axis = subspace[:3] if joint.kind == "prismatic" else subspace[3:]
         if not _same(axis, joint.axis):
             yield _difference(f"joint {joint.name!r}", "its <axis>", axis, joint.axis)
-        q, v = model.idx_qs[index], model.idx_vs[index]
+        q = model.idx_qs[index]
+        v = model.idx_vs[index]
         limits = {
             "lower": model.lowerPositionLimit[q],
             "upper": model.upperPositionLimit[q],
@@ -443,7 +450,8 @@ def _same(actual: object, expected: object, *, scale: float | None = None) -> bo
 
     Values that are not finite never are.
     """
-    found, wanted = np.asarray(actual, float), np.asarray(expected, float)
+    found = np.asarray(actual, float)
+    wanted = np.asarray(expected, float)
     size = np.abs(wanted).max() if scale is None else scale
     with np.errstate(all="ignore"):
         close = np.abs(found - wanted) <= MAX_RELATIVE_DIFFERENCE * size

@@ -29,7 +29,8 @@ class UnexpectedValueError(UsageError):
 
     def __init__(self, expected: str, got: str, *, argument: str) -> None:
         super().__init__(f"must be {expected}, got {got}", argument=argument)
-        self.expected, self.got = expected, got
+        self.expected = expected
+        self.got = got
 
     def __reduce__(self) -> tuple[Any, ...]:
         """Pickle for worker processes."""

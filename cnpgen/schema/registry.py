@@ -145,7 +145,8 @@ def load(group: str, name: str, base: type[Any] | None = None) -> type[Any]:
             ]
         )
     source, importer = next(iter(sources.items()))
-    what, base = f"{noun} {name!r} of {source}", base or contract(group)
+    what = f"{noun} {name!r} of {source}"
+    base = base or contract(group)
     try:
         kind: type[Any] = importer()
     except MissingAddonError:

@@ -96,7 +96,8 @@ def check_dataset(folder: Path) -> list[Finding]:
     findings, manifest = _check_manifest(folder, spec)
     findings = links + findings
     # Without a manifest only shards with a sidecar count: others are still to be made.
-    entries, finished = shard_entries(manifest), (folder / MANIFEST).exists()
+    entries = shard_entries(manifest)
+    finished = (folder / MANIFEST).exists()
     for task in shards(spec):
         entry = entries.get(task.file)
         if finished or (folder / task.sidecar).exists():
@@ -138,7 +139,8 @@ def _check_manifest(
         return [finding(f"is of another specification than {SPECIFICATION}")], {}
     if not lists_shards_of(manifest, spec):
         return [finding(f"lists other shards than {SPECIFICATION}")], {}
-    entries, findings = shard_entries(manifest).items(), []
+    entries = shard_entries(manifest).items()
+    findings = []
     # The manifest may be intact by its own checksum and still list shards of another
     # run.
     listed = data_fingerprint((file, entry["sha256"]) for file, entry in entries)
@@ -255,7 +257,8 @@ def check_content(folder: Path, spec: DatasetSpec, task: ShardTask) -> list[Find
     """
     path = folder / task.file
     try:
-        attributes, schema = read_attributes(path), read_schema(path)
+        attributes = read_attributes(path)
+        schema = read_schema(path)
     except DatasetError as error:
         return [Finding(task.file, _reason(error, path), hint=DELETE_HINT)]
     expected = {
@@ -304,7 +307,8 @@ def _check_field(
     field: Field, stored: StoredField, spec: DatasetSpec, task: ShardTask
 ) -> list[str]:
     """Compare the description of a field in a shard with the specification."""
-    shape, dtype = field.shape(task.rows), storage_dtype(field, spec.dtype)
+    shape = field.shape(task.rows)
+    dtype = storage_dtype(field, spec.dtype)
     problems = []
     if stored.shape != shape or stored.dtype != dtype:
         problems.append(

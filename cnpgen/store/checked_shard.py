@@ -30,7 +30,8 @@ from cnpgen.store.shard import (
     storage_dtype,
 )
 
-SAMPLE_ID, PARAMETERS = "sample_id", "parameters"
+SAMPLE_ID = "sample_id"
+PARAMETERS = "parameters"
 STORED_ROUNDING = 1e-6  # relative
 
 
@@ -97,7 +98,8 @@ def read_scenes(
     ``check_header`` returns the placements.
     """
     placements = check_header(shard) if placements is None else placements
-    names, spec = [item.name for item in SCENE_ARRAYS], shard.spec
+    names = [item.name for item in SCENE_ARRAYS]
+    spec = shard.spec
     try:
         check_shapes(
             {name: placements[name].shape for name in names if name in placements},
@@ -120,7 +122,8 @@ def check_header(shard: Shard) -> dict[str, StoredField]:
     the specification.
     """
     placements, identity = read_placements(shard.path)
-    spec, task = shard.spec, shard.task
+    spec = shard.spec
+    task = shard.task
     # A shard of an extended dataset has the key of the version that first contained it.
     key = spec.version_with(task).key
     if identity != {
@@ -140,7 +143,8 @@ def check_header(shard: Shard) -> dict[str, StoredField]:
 
 def check_field(shard: Shard, item: Field, placement: StoredField | None) -> None:
     """Raise an error if a field of a shard does not have the shape and type of the specification."""
-    shape, dtype = item.shape(shard.rows), storage_dtype(item, shard.spec.dtype)
+    shape = item.shape(shard.rows)
+    dtype = storage_dtype(item, shard.spec.dtype)
     if (
         placement is None
         or placement.shape != shape
@@ -203,8 +207,10 @@ def _range_problem(spec: DatasetSpec, columns: Mapping[str, NDArray[Any]]) -> st
     fields = {field.name: field for field in spec.fields if field.valid_max}
     if PARAMETERS not in columns.keys() & fields.keys():
         return ""
-    rows, field = columns[PARAMETERS], fields[PARAMETERS]
-    low, high = np.array(field.valid_min), np.array(field.valid_max)
+    rows = columns[PARAMETERS]
+    field = fields[PARAMETERS]
+    low = np.array(field.valid_min)
+    high = np.array(field.valid_max)
     # Ends of a range may be rounded to float32.
     slack = STORED_ROUNDING * np.maximum(np.abs(low), np.abs(high))
     outside = (rows < low - slack) | (rows > high + slack)

@@ -107,7 +107,8 @@ def summarize_dataset(
     Otherwise a shard that is missing, damaged or of another specification raises
     DatasetError, which names it.
     """
-    records, problems = [], []
+    records = []
+    problems = []
     for task in shards(spec):
         try:
             records.append((task, _load_record_with_fields(folder, spec, task)))

@@ -164,7 +164,9 @@ def _attributes(item: object, *names: str) -> dict[str, Any]:
 
 def _yield(sampling: SamplingStatistics) -> dict[str, Any]:
     """Return the numbers of candidates and, in pipeline order, of rejections with the fractions that remain."""
-    tried, left, steps = max(sampling.tried, 1), sampling.tried, []
+    tried = max(sampling.tried, 1)
+    left = sampling.tried
+    steps = []
     for reason, count in sampling.rejections.items():
         # Each reason removes its candidates from those that earlier stages left.
         left -= count

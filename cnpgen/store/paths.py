@@ -12,7 +12,8 @@ from cnpgen.store.layout import SPECIFICATION
 from cnpgen.store.workspace import is_dataset
 
 # Names of a folder that are compared, and their share of equal letters.
-MAX_SIMILAR_PATHS, MIN_SIMILARITY = 1000, 0.65
+MAX_SIMILAR_PATHS = 1000
+MIN_SIMILARITY = 0.65
 ANY_HDF5 = "an HDF5 file"  # of other software
 _KIND_OF_FORMAT = {"cnpgen-plans": PLANS, "cnpgen-shard": "a shard of a dataset"}
 HDF5_KINDS = (ANY_HDF5, *_KIND_OF_FORMAT.values())
@@ -142,10 +143,8 @@ def _hdf5_kind(path: Path) -> str:
 
     try:
         with open_hdf5(path) as file:
-            format_name, names = (
-                file.attributes.some(["format"]).get("format"),
-                set(file),
-            )
+            format_name = file.attributes.some(["format"]).get("format")
+            names = set(file)
     except (DatasetError, MachineError):
         return ANY_HDF5
     if isinstance(format_name, bytes):

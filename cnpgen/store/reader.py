@@ -79,10 +79,8 @@ class StoredDataset:
             name: [self._no_rows(name)] for name in names
         }
         for task in tasks:
-            low, high = (
-                max(start - task.first_row, 0),
-                min(stop - task.first_row, task.rows),
-            )
+            low = max(start - task.first_row, 0)
+            high = min(stop - task.first_row, task.rows)
             if low < high:
                 columns = read_rows(self._checked(task), names)
                 for name in names:

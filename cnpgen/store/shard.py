@@ -102,16 +102,15 @@ def _check_columns(
     """Raise an error if the columns do not fit the fields."""
     names = {field.name for field in fields}
     if columns.keys() != names or rows < 1:
-        missing, extra = sorted(names - columns.keys()), sorted(columns.keys() - names)
+        missing = sorted(names - columns.keys())
+        extra = sorted(columns.keys() - names)
         raise DatasetError(
             f"a shard needs rows and every field: {rows} rows, missing {missing}, unknown {extra}"
         )
     for field in fields:
-        values, shape, stored = (
-            columns[field.name],
-            field.shape(rows),
-            storage_dtype(field, dtype),
-        )
+        values = columns[field.name]
+        shape = field.shape(rows)
+        stored = storage_dtype(field, dtype)
         if values.shape != shape or values.dtype != stored:
             actual = f"{values.dtype} of shape {values.shape}"
             raise DatasetError(

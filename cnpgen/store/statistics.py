@@ -186,10 +186,8 @@ def _limits(field: Field, columns: int) -> tuple[Floats, Floats] | tuple[None, N
     """Return the limits of every column, shape (c,) each, or (None, None) if a limit is missing or infinite."""
     if field.valid_min is None or field.valid_max is None:
         return None, None
-    low, high = (
-        np.array(field.valid_min, np.float64),
-        np.array(field.valid_max, np.float64),
-    )
+    low = np.array(field.valid_min, np.float64)
+    high = np.array(field.valid_max, np.float64)
     if low.shape != (columns,) or high.shape != (columns,):
         raise DatasetError(
             f"field {field.name!r} must have {columns} limits, got {low.shape} and {high.shape}"

@@ -235,7 +235,8 @@ def _cleared(workspace: Workspace) -> Workspace:
     """Delete the dataset in a folder, and no other files: see ``check_clearable``."""
     if workspace.content != "a dataset":
         return workspace
-    folder, splits = workspace.folder, check_clearable(workspace)
+    folder = workspace.folder
+    splits = check_clearable(workspace)
     with machine_errors("delete from", folder):
         # First: a partially deleted dataset must not appear complete.
         (folder / MANIFEST).unlink(missing_ok=True)
@@ -256,7 +257,8 @@ def check_clearable(workspace: Workspace) -> list[Path]:
     These are the splits of the specification, or all folders with shards if the
     specification cannot be read.
     """
-    folder, spec = workspace.folder, workspace.spec
+    folder = workspace.folder
+    spec = workspace.spec
     named = sorted({path.parent for path in _shard_files(folder)})
     if spec is not None:
         # With a specification the splits are known, even those without shards.

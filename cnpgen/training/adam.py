@@ -12,10 +12,13 @@ import numpy as np
 
 from cnpgen.arrays import AnyArray
 
-BETA_1, BETA_2, EPSILON = 0.9, 0.999, 1e-8
+BETA_1 = 0.9
+BETA_2 = 0.999
+EPSILON = 1e-8
 # Small enough for the five arrays of a block to stay in the CPU cache.
 PARAMETERS_PER_BLOCK = 1 << 17
-SAMPLE_MEMORY, BATCH_MEMORY = 0.98, 0.99
+SAMPLE_MEMORY = 0.98
+BATCH_MEMORY = 0.99
 # Of a batch's norm to the running norm, in the update of the latter.
 MAX_NORM_RATIO = 3.0
 
@@ -70,12 +73,11 @@ class Adam:
         epsilon: float,
         new: float,
     ) -> None:
-        first, second, parameters = (
-            self.first[part],
-            self.second[part],
-            self.parameters[part],
-        )
-        average, work = self.average[part], scratch[: len(gradient)]
+        first = self.first[part]
+        second = self.second[part]
+        parameters = self.parameters[part]
+        average = self.average[part]
+        work = scratch[: len(gradient)]
         # m = b1 m + (1 - b1) g
         first *= BETA_1
         first += np.multiply(gradient, 1 - BETA_1, out=work)

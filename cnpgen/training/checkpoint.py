@@ -28,7 +28,8 @@ from cnpgen.store.files.document_structure import (
 from cnpgen.store.files.documents import differences, parse_json
 from cnpgen.training.adam import Adam, Clipping, start_adam
 
-CHECKPOINT_KIND, CHECKPOINT_VERSION = "cnpgen-checkpoint", 2
+CHECKPOINT_KIND = "cnpgen-checkpoint"
+CHECKPOINT_VERSION = 2
 MIN_INTERVAL_S, MAX_INTERVAL_S = 20.0, 50.0  # wall time between two checkpoints
 INTERVAL_PER_WRITING_TIME = 20.0
 _ADAM_ARRAYS = ("parameters", "average", "first", "second")
@@ -121,7 +122,8 @@ def start_state(
 
 def to_content(state: State) -> Content:
     """Convert a state to arrays and texts."""
-    adam, best = state.adam, state.best
+    adam = state.adam
+    best = state.best
     arrays = {name: getattr(adam, name) for name in _ADAM_ARRAYS}
     numbers = {
         "step": adam.step,
@@ -155,12 +157,11 @@ def from_content(content: Content) -> State:
         KeyError, TypeError, ValueError: A key is missing, unknown to this version, or
             has an invalid value.
     """
-    numbers, arrays = parse_json(content.texts["numbers"]), content.arrays
+    numbers = parse_json(content.texts["numbers"])
+    arrays = content.arrays
     check_structure(numbers, _FORM)
-    best, shapes = (
-        numbers["best"],
-        {arrays[name].shape for name in (*_ADAM_ARRAYS, "best")},
-    )
+    best = numbers["best"]
+    shapes = {arrays[name].shape for name in (*_ADAM_ARRAYS, "best")}
     if len(shapes) > 1 or len(shapes.pop()) != 1 or arrays["terms"].ndim != 1:
         raise ValueError("its arrays do not belong to one network")
     return State(
@@ -209,10 +210,8 @@ class Checkpoints:
             self.path, kind=CHECKPOINT_KIND, version=CHECKPOINT_VERSION
         )
         try:
-            identity, state = (
-                parse_json(content.texts["identity"]),
-                from_content(content),
-            )
+            identity = parse_json(content.texts["identity"])
+            state = from_content(content)
         except (KeyError, TypeError, ValueError) as error:
             raise DatasetError(
                 f"{self.path} does not fit this version of cnpgen: {error!r}"
@@ -233,7 +232,8 @@ class Checkpoints:
 
     def save(self, state: State) -> None:
         """Save the state."""
-        started, content = time.monotonic(), to_content(state)
+        started = time.monotonic()
+        content = to_content(state)
         content = replace(
             content, texts={**content.texts, "identity": json.dumps(self.identity)}
         )

@@ -157,10 +157,12 @@ class SceneRows(TrainingData):
     def training(self) -> TrainingProblems:
         """Return all training rows."""
         training = slice(0, len(self.boundary) - self.n_validation)
-        start, goal = self.boundary.start_q[training], self.boundary.goal_q[training]
+        start = self.boundary.start_q[training]
+        goal = self.boundary.goal_q[training]
         zero = np.zeros((2 * len(start), start.shape[1]))
         # From rest to rest, each problem reversed is one, too.
-        there, back = np.concatenate([start, goal]), np.concatenate([goal, start])
+        there = np.concatenate([start, goal])
+        back = np.concatenate([goal, start])
         return TrainingProblems(
             Boundary(there, zero, zero, back, zero),
             np.tile(self.obstacle_poses[training], (2, 1)),

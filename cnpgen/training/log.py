@@ -25,7 +25,8 @@ class TrainingLog:
     """
 
     def __init__(self, path: Path, lines: list[str]) -> None:
-        self.path, self.lines = path, lines
+        self.path = path
+        self.lines = lines
         write_file(path, self.text)
 
     def write(self, record: Mapping[str, Any]) -> None:
@@ -78,7 +79,8 @@ def plot_curve(log: str, path: str | Path) -> None:
 
 def _draw_violations(axis: "Axes", steps: list[dict[str, Any]]) -> None:
     """Draw the mean violations over their budgets in the problem file, or as they are if none has a budget."""
-    seconds, budgets = _column(steps, "seconds"), steps[0].get("budgets", {})
+    seconds = _column(steps, "seconds")
+    budgets = steps[0].get("budgets", {})
     weights = steps[0]["weights"]
     for name in [name for name in weights if budgets.get(name)] or weights:
         values = [record["terms"][name] / (budgets.get(name) or 1) for record in steps]

@@ -92,8 +92,10 @@ def prepare_run(
         zero_conditions=zero,
         training=_record(source, settings, command, rows, initial_model),
     )
-    loss, held_out = _loss(loaded, settings), source.checked(check_rows)
-    spec, along = loaded.problem.trajectory, inference.prepare.along
+    loss = _loss(loaded, settings)
+    held_out = source.checked(check_rows)
+    spec = loaded.problem.trajectory
+    along = inference.prepare.along
     projection = _projection(loaded, settings, boundary.fixed_at_goal)
     run = Run(
         Learner(architecture, spec, loss, settings, projection, along, features),
@@ -180,7 +182,8 @@ def _initial_features(
     loaded: LoadedProblem, settings: TrainingSettings, boundary: Boundary
 ) -> tuple[tuple[str, ...], Features | None]:
     """Return the blocks of a new model's features, and the features if they do not depend on the rows."""
-    placed, iterated = loaded.problem.has_sample_obstacles, settings.iterations > 1
+    placed = loaded.problem.has_sample_obstacles
+    iterated = settings.iterations > 1
     blocks = feature_blocks(
         boundary, settings.features, placed=placed, iterated=iterated
     )
@@ -223,13 +226,15 @@ def input_ranges(
 
     The rows of an initial model count, too, if it stores their ranges. JSON-able.
     """
-    low, high = inputs.min(axis=0), inputs.max(axis=0)
+    low = inputs.min(axis=0)
+    high = inputs.max(axis=0)
     earlier = (
         None if initial_model is None else initial_model.training.get("input_ranges")
     )
     if earlier is not None:
         # The parameters have been trained on the inputs of both runs.
-        low, high = np.minimum(low, earlier["low"]), np.maximum(high, earlier["high"])
+        low = np.minimum(low, earlier["low"])
+        high = np.maximum(high, earlier["high"])
     return {
         name: [float(f"{value:.8g}") for value in values.tolist()]
         for name, values in (("low", low), ("high", high))
@@ -246,10 +251,8 @@ def _with_demonstrations(
             " make_dataset(..., certify=True) or 'cnpgen make-dataset --certify', or train without imitation"
         )
     spec = loaded.problem.trajectory
-    theirs, ours = (
-        (target.path.shape[1], target.rate.shape[1]),
-        (spec.path_control_points, spec.rate_control_points),
-    )
+    theirs = (target.path.shape[1], target.rate.shape[1])
+    ours = (spec.path_control_points, spec.rate_control_points)
     if theirs != ours:
         raise UsageError(
             f"the plans to imitate have {theirs} control points, these motions {ours}"
@@ -378,10 +381,12 @@ def _fresh(run: Run, steps: int) -> State:
 
 def _step_seconds(run: Run) -> float:
     """Measure the CPU time of a step [s], on a temporary state."""
-    state, metric = _fresh(run, 10_000), run.metric.state()
+    state = _fresh(run, 10_000)
+    metric = run.metric.state()
     # The time of a step is that of the loss, not of imitation.
     state.imitating = 0
-    gradient, times = np.empty_like(state.adam.parameters), []
+    gradient = np.empty_like(state.adam.parameters)
+    times = []
     for _ in range(WARM_UP_STEPS + TIMED_STEPS):
         started = time.process_time()
         run.step(state, gradient)

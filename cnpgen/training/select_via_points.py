@@ -100,7 +100,8 @@ def _planned(
 
 def _greedy_cover(repaired: NDArray[np.bool_], count: int) -> list[int]:
     """Return rows of a table whose union has most columns, selected greedily."""
-    selected, remaining = list[int](), np.ones(repaired.shape[1], bool)
+    selected = list[int]()
+    remaining = np.ones(repaired.shape[1], bool)
     while len(selected) < count and repaired[:, remaining].any():
         # Greedy maximum coverage: the candidate that repairs most of the plans that are
         # still violating.

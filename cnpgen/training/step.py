@@ -107,7 +107,8 @@ class Learner:
         clipping: Clipping,
         out: AnyArray,
     ) -> AnyArray:
-        network, scale = self.architecture.split(parameters), self.settings.path_scale
+        network = self.architecture.split(parameters)
+        scale = self.settings.path_scale
         part = out
         for iteration in range(self.settings.iterations):
             activations = forward(network, rows.features)
@@ -191,7 +192,8 @@ class Learner:
         usable = np.isfinite(norms)
         if not usable.all():
             # Samples without a finite gradient take no part in the step.
-            phi[~usable], log_rate[~usable] = 0, 0
+            phi[~usable] = 0
+            log_rate[~usable] = 0
             norms = np.where(usable, norms, 0)
         factors = clipping.sample_factors(norms, limit=self.settings.sample_clip)
         # The mean over the batch.

@@ -35,7 +35,10 @@ from cnpgen.training.training_options import TrainingOptions
 
 DEFAULT_CPU_TIME_S = 120.0
 # In place of .h5.
-CHECKPOINT, LOG, PICTURE, LOCK = ".checkpoint", ".jsonl", ".png", ".lock"
+CHECKPOINT = ".checkpoint"
+LOG = ".jsonl"
+PICTURE = ".png"
+LOCK = ".lock"
 MAX_SCORED_ROWS = 2000  # validation rows for the final score
 
 
@@ -110,13 +113,15 @@ def train_model(
     """
     clock = Stopwatch()
     chosen = with_old_keywords("train_model", options, TrainingOptions(), old_keywords)
-    out, settings = Path(out), settings or TrainingSettings()
+    out = Path(out)
+    settings = settings or TrainingSettings()
     lengths = {"steps": steps, "epochs": chosen.epochs, "cpu_seconds": cpu_seconds}
     passed: dict[str, Any] = {
         name: value for name, value in lengths.items() if value is not None
     }
     passed = passed or {"cpu_seconds": DEFAULT_CPU_TIME_S}
-    length, check_rows = Length(**passed), integer("check_rows", check_rows, least=1)
+    length = Length(**passed)
+    check_rows = integer("check_rows", check_rows, least=1)
     check_out(out)
     remove_temporary_files(out)
     source = open_training_data(folder, chosen.robot)
@@ -271,11 +276,10 @@ def check_out(out: Path) -> None:
 
 def check_beside(out: Path) -> None:
     """Raise UsageError if a log or a picture of another origin beside a model's file would be replaced."""
-    log, picture = out.with_suffix(LOG), out.with_suffix(PICTURE)
-    hint, remedies = (
-        "choose another {out}, or replace it with {force}",
-        {"out": None, "force": True},
-    )
+    log = out.with_suffix(LOG)
+    picture = out.with_suffix(PICTURE)
+    hint = "choose another {out}, or replace it with {force}"
+    remedies = {"out": None, "force": True}
     if log.exists() and not is_log(log):
         raise UsageError(
             f"{log} exists and is no training log: {hint}", remedies=remedies

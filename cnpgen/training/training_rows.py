@@ -74,7 +74,8 @@ def prepare_rows(
         for first in range(0, max(len(boundary), 1), PREPARED_ROWS_PER_BLOCK)
     ]
     # Features do not depend on the projected line, which takes most of the time.
-    straight, placed = replace(prepare, line=None), bool(prepare.placed)
+    straight = replace(prepare, line=None)
+    placed = bool(prepare.placed)
     poses = [None if obstacle_poses is None else obstacle_poses[part] for part in parts]
     pairs = list(zip(parts, poses, strict=True))
     definition = features or fit_features(
@@ -133,7 +134,9 @@ class StepRows:
     def __init__(self, rows: int, batch_size: int, seed: int) -> None:
         self.batch_size = min(batch_size, rows)
         self.batches = rows // self.batch_size
-        self._rows, self._seed, self._epoch = rows, seed, -1
+        self._rows = rows
+        self._seed = seed
+        self._epoch = -1
         self._order: NDArray[np.int64] = np.empty(0, np.int64)
 
     def batch(self, step: int) -> NDArray[np.int64]:
@@ -142,8 +145,6 @@ class StepRows:
         # continues it.
         epoch, index = divmod(step, self.batches)
         if epoch != self._epoch:
-            self._epoch, self._order = (
-                epoch,
-                Order("train", (self._rows,), self._seed, epoch).rows_of(0),
-            )
+            self._epoch = epoch
+            self._order = Order("train", (self._rows,), self._seed, epoch).rows_of(0)
         return self._order[index * self.batch_size : (index + 1) * self.batch_size]

@@ -88,7 +88,8 @@ class Run:
 
     def step(self, state: State, gradient: AnyArray) -> None:
         """Take one step; ``gradient`` is a buffer of shape (n_parameters,)."""
-        adam, step = state.adam, state.adam.step
+        adam = state.adam
+        step = state.adam.step
         rows = self.rows.take(self.order.batch(step))
         if step < state.imitating:
             distances = self.learner.imitation_gradient(
@@ -133,7 +134,8 @@ class Run:
 
     def _due(self, state: State) -> list[dict[str, Any]]:
         """Return the records of the log that are due after this step."""
-        step, records = state.adam.step, []
+        step = state.adam.step
+        records = []
         if _is_due(step, state.steps, LOG_LINES):
             records.append(self._progress(state))
         if _is_due(step, state.steps, self.learner.settings.validations):
@@ -142,7 +144,8 @@ class Run:
 
     def _progress(self, state: State) -> dict[str, Any]:
         """Return the means of the terms since the last line."""
-        sums, step = state.sums, state.adam.step
+        sums = state.sums
+        step = state.adam.step
         state.sums = Sums(np.zeros_like(sums.terms))
         # The run diverges if more than half of the plans have no finite loss.
         if sums.lost > sums.steps * self.order.batch_size // 2:
@@ -161,10 +164,8 @@ class Run:
         }
 
     def _means(self, state: State, sums: Sums) -> dict[str, Any]:
-        means, weights = (
-            sums.terms / sums.steps,
-            self.metric.weights(state.progress(state.adam.step - 1)),
-        )
+        means = sums.terms / sums.steps
+        weights = self.metric.weights(state.progress(state.adam.step - 1))
         return {
             # L = task loss + sum of weight times constraint term
             "loss": float(means[0] + means[1:] @ weights),
@@ -175,7 +176,8 @@ class Run:
 
     def _check(self, state: State) -> dict[str, Any]:
         """Validate the averaged parameters; keep them if they are the best so far."""
-        started, step = time.process_time(), state.adam.step
+        started = time.process_time()
+        step = state.adam.step
         record = self.validate(self.model(state.adam.average))
         if self.learner.settings.keep == "last" or record["score"] >= state.best.score:
             state.best = Best(record["score"], step, state.adam.average.copy())

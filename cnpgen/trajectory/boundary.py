@@ -220,7 +220,8 @@ def boundary_of(  # noqa: PLR0917 - in the order of the paper
     check_memory_of_rows({name: len(values) for name, values in arrays.items()}, 6 * n)
     if goal_ddq is None:
         del arguments["goal_ddq"]
-    zero, names = np.zeros((1, n)), {**arguments, **arrays}
+    zero = np.zeros((1, n))
+    names = {**arguments, **arrays}
     return Boundary(**{name: _repeated(arrays.get(name, zero), rows) for name in names})
 
 
@@ -339,7 +340,9 @@ def _three(
     c2 = second / path.beta - 2 * q + 3 * c1
     # np.stack takes as long as the computation
     points = np.empty((len(q), 3, q.shape[1]), c2.dtype)
-    points[:, 0], points[:, 1], points[:, 2] = q, c1, c2
+    points[:, 0] = q
+    points[:, 1] = c1
+    points[:, 2] = c2
     return points
 
 
@@ -362,10 +365,8 @@ def anchor_line(boundary: Boundary, rate: Array, spec: TrajectorySpec) -> Array:
 
     It is that of the paper's equation of the configuration points.
     """
-    first, last = (
-        start_points(boundary, rate, spec)[:, 2:3],
-        goal_points(boundary, rate, spec)[:, :1],
-    )
+    first = start_points(boundary, rate, spec)[:, 2:3]
+    last = goal_points(boundary, rate, spec)[:, :1]
     count = spec.path_control_points - 3 - boundary.fixed_at_goal
     along = np.linspace(0, 1, count)[:, None]
     return first * (1 - along) + last * along
@@ -385,7 +386,9 @@ def boundary_derivatives(
     boundary: Boundary, rate: Array, spec: TrajectorySpec
 ) -> list[BoundaryDerivative]:
     """Differentiate ``start_points`` and ``goal_points`` in rate control points, (N, R); other derivatives are zero."""
-    b, last, points = boundary, spec.rate_control_points - 1, spec.path_control_points
+    b = boundary
+    last = spec.rate_control_points - 1
+    points = spec.path_control_points
     c1, c2, c2_inner = _three_derivatives(
         b.start_dq, b.start_ddq, rate[:, :1], rate[:, 1:2], spec
     )

@@ -34,7 +34,8 @@ MIN_FIT_ERROR_RAD = 1e-6  # smaller errors count as equal, and the simplest r is
 MAX_RATE_FIT_SAMPLES = 2000  # in the optimization of r
 MAX_LOG_RATE_CHANGE = 4.0  # in the optimization of r
 # Weights of p''' and of second differences of log r; positions: rad.
-PATH_SMOOTHNESS, RATE_SMOOTHNESS = 1e-8, 3e-5
+PATH_SMOOTHNESS = 1e-8
+RATE_SMOOTHNESS = 3e-5
 
 
 @checked_arguments
@@ -165,12 +166,14 @@ class _Fit:
         s = time + mixture * (length / length[-1] - time) if length[-1] > 0 else time
         # Mean rate around each Greville abscissa: (change of phase) / (time that
         # passes).
-        points, degree = self.spec.rate_control_points, self.spec.degree
+        points = self.spec.rate_control_points
+        degree = self.spec.degree
         greville = sliding_window_view(
             clamped_knots(points, degree)[1:-1], degree
         ).mean(axis=1)
         half = 0.5 / (points - degree)
-        low, high = np.clip(greville - half, 0, 1), np.clip(greville + half, 0, 1)
+        low = np.clip(greville - half, 0, 1)
+        high = np.clip(greville + half, 0, 1)
         passed = np.interp(high, s, self.t) - np.interp(low, s, self.t)
         return self._timed(((high - low) / passed)[None])
 
@@ -192,7 +195,8 @@ class _Fit:
 
     def path(self, rate: Array) -> _Path:
         """Fit the path for a rate of shape (1, R)."""
-        points, degree = self.spec.path_control_points, self.spec.degree
+        points = self.spec.path_control_points
+        degree = self.spec.degree
         # Phases of the samples follow from r: t(s) is its integral of 1 / r.
         s = self._motion(rate).phase_at(self.t[None])[0]
         smoothing = (

@@ -79,7 +79,8 @@ class JoinedMotion:
 
 def _check_joint(before: Motion, after: Motion, start: Array, cut_time: Array) -> None:
     """Raise an error for cuts outside the part before, and for parts that do not start in its state at the cut."""
-    duration, cut = before.duration(), cut_time - start
+    duration = before.duration()
+    cut = cut_time - start
     # Relative rounding of the duration may put a cut at the end slightly behind it.
     outside = ~((cut >= 0) & (cut <= duration * (1 + 1e-12)))
     if outside.any():
@@ -89,10 +90,8 @@ def _check_joint(before: Motion, after: Motion, start: Array, cut_time: Array) -
             f"plan {row} cannot be cut at {cut_time[row]:.6g} s: its last part lasts {interval}",
             concerns="at",
         )
-    left, right = (
-        states_at_times(before, cut),
-        states_at_times(after, np.zeros_like(cut)),
-    )
+    left = states_at_times(before, cut)
+    right = states_at_times(after, np.zeros_like(cut))
     # Control points have rounding errors, which derivatives multiply by eta r and beta
     # r^2.
     tolerance = MAX_JOINT_GAP + _rounding(before) + _rounding(after)
@@ -115,10 +114,8 @@ def _check_joint(before: Motion, after: Motion, start: Array, cut_time: Array) -
 
 def _rounding(motion: Motion) -> Array:
     """Estimate the errors of positions, velocities and accelerations by rounding of control points, shape (3, N)."""
-    ends, largest = (
-        end_derivatives(motion.path.shape[1], motion.degree),
-        motion.rate.max(axis=1),
-    )
+    ends = end_derivatives(motion.path.shape[1], motion.degree)
+    largest = motion.rate.max(axis=1)
     orders = np.array(
         [np.ones_like(largest), ends.eta * largest, ends.beta * largest**2]
     )

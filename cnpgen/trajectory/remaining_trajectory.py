@@ -97,10 +97,8 @@ def _fitted(
     motion: Motion, t: Array, duration: Array, boundary: Boundary, spec: TrajectorySpec
 ) -> Motion:
     """Fit rate and path to a motion after times t at equal phases, and scale the rate to the duration."""
-    n, free = (
-        motion.path.shape[2],
-        slice(3, spec.path_control_points - boundary.fixed_at_goal),
-    )
+    n = motion.path.shape[2]
+    free = slice(3, spec.path_control_points - boundary.fixed_at_goal)
     # Phases of the remainder from 0 to 1; at these, q and r are those of the motion.
     phases, rate_fit, path_basis, path_fit = _fits(spec, free.stop)
     first = motion.phase_at(t[:, None])

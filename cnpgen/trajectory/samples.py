@@ -40,7 +40,8 @@ def checked_samples(
         UsageError: A shape is wrong, the times do not increase, or a value is not
             finite.
     """
-    times, positions = numbers("t", t), numbers("q", q)
+    times = numbers("t", t)
+    positions = numbers("q", q)
     velocities = None if dq is None else numbers("dq", dq)
     if (
         times.ndim != 1
@@ -150,14 +151,16 @@ def _derivatives(t: Array, q: Array, velocity: Array | None) -> tuple[Array, Arr
     """Estimate the velocity, unless it is known, and the acceleration at t = 0."""
     # Smaller velocities are noise of a robot at rest.
     min_speed = MAX_REST_SPEED_RATIO * np.abs(q[-1] - q[0]).max() / t[-1]
-    travel, first = q[1:] - q[0], 1
+    travel = q[1:] - q[0]
+    first = 1
     if velocity is None:
         velocity = _cubic(t[1:], travel, first)
         velocity = np.where(np.abs(velocity) < min_speed, 0.0, velocity)
     if len(t) < 3:
         return velocity, np.zeros_like(velocity)
     # Without the part that the velocity explains, the travel begins with t^2.
-    travel, first = travel - velocity * t[1:, None], 2
+    travel = travel - velocity * t[1:, None]
+    first = 2
     acceleration = 2 * _cubic(t[1:], travel, first)
     return velocity, np.where(
         np.abs(acceleration) < 10 * min_speed / t[-1], 0.0, acceleration

@@ -53,7 +53,8 @@ def basis_tables(
     spec: TrajectorySpec, s: Array, orders: int
 ) -> tuple[list[Array], list[Array]]:
     """Evaluate the bases of p, shape (K, C), at K phases for each of some orders, and those of r, (K, R), one order less."""
-    path, rate = spec.path_control_points, spec.rate_control_points
+    path = spec.path_control_points
+    rate = spec.rate_control_points
     return (
         [basis(s, path, spec.degree, order) for order in range(orders)],
         [basis(s, rate, spec.degree, order) for order in range(orders - 1)],
@@ -66,7 +67,8 @@ def derivative(points: int, degree: int, order: int) -> tuple[Array, Array]:
     The shapes are (C + D + 1 - 2 order,) and (C - order, C); the derivative's degree is
     D - order.
     """
-    knots, matrix = clamped_knots(points, degree), np.eye(points)
+    knots = clamped_knots(points, degree)
+    matrix = np.eye(points)
     for p in range(degree, degree - order, -1):
         # c'_i = p (c_{i+1} - c_i) / (t_{i+p+1} - t_{i+1}), as rows of a matrix.
         matrix = (
@@ -86,7 +88,8 @@ def _cox_de_boor(s: Array, knots: Array, degree: int, first: NDArray[np.intp]) -
     weights = np.ones((1, len(s)))
     right = first + degree + 1 + np.arange(degree)[:, None]
     for p in range(1, degree + 1):
-        high, low = knots[right[:p]], knots[right[:p] - p]
+        high = knots[right[:p]]
+        low = knots[right[:p] - p]
         # Each weight is shared between two functions of the next degree, in proportion
         # to the distances from their knots.
         share = weights / (high - low)
@@ -173,7 +176,8 @@ def derivatives_of_each(control: Array, degree: int, s: Array) -> Array:
 @cache
 def _powers(degree: int) -> tuple[Array, Array]:
     """Return factors and exponents of x in the derivatives of x^k, shape (3, D + 1) each."""
-    orders, powers = range(ORDERS), range(degree + 1)
+    orders = range(ORDERS)
+    powers = range(degree + 1)
     factor = np.array([[perm(k, order) for k in powers] for order in orders], float)
     return factor, np.array([[max(k - order, 0) for k in powers] for order in orders])
 

@@ -74,7 +74,8 @@ class Motion:
 
     def __post_init__(self) -> None:
         try:
-            path, rate = np.shape(self.path), np.shape(self.rate)
+            path = np.shape(self.path)
+            rate = np.shape(self.rate)
         except ValueError as error:
             # Rows of different lengths.
             raise UsageError(
@@ -161,10 +162,8 @@ class Motion:
                     select_spans(power_coefficients(control, self.degree), s)
                     for control in (self.path, self.rate)
                 )
-                p, r = (
-                    [horner(*path, i) for i in range(4)],
-                    [horner(*rate, i) for i in range(3)],
-                )
+                p = [horner(*path, i) for i in range(4)]
+                r = [horner(*rate, i) for i in range(3)]
             q, dq, ddq, jerk = time_derivatives(p, [values[..., None] for values in r])
             return States(q, dq, ddq, jerk, rate=r[0])
 
@@ -195,7 +194,8 @@ class Motion:
         1 / r is convex in r, so it is at most the mean of 1 / r_j with the weights of
         the basis at a phase (Jensen).
         """
-        points, degree = self.rate.shape[1], self.degree
+        points = self.rate.shape[1]
+        degree = self.degree
         knots = clamped_knots(points, degree)
         # The integral of a basis function is (t_{j+D+1} - t_j) / (D + 1), its weight in
         # the bound.
@@ -232,7 +232,8 @@ class Motion:
 
     def _times_at(self, edges: Array, table: Array) -> Array:
         """Compute the time at edges of cells, shape (N, edges), from the basis at their Gauss nodes, (R, cells x 8)."""
-        width, times = np.diff(edges), np.zeros((len(self), len(edges)))
+        width = np.diff(edges)
+        times = np.zeros((len(self), len(edges)))
         for block in self._blocks(table.shape[1]):
             # Invalid inputs give invalid results.
             with np.errstate(all="ignore"):
@@ -282,7 +283,8 @@ class Motion:
             )
             # Start from linear interpolation within the cell; left is the time still to
             # go.
-            low, width = edges[cell], np.diff(edges)[cell]
+            low = edges[cell]
+            width = np.diff(edges)[cell]
             rate, offset = select_spans(
                 power_coefficients(self.rate, self.degree), low + width / 2
             )
@@ -347,7 +349,8 @@ class Motion:
         All motions share the edges, except those whose r has control points that are
             not positive: it may nearly be 0.
         """
-        points, degree = self.rate.shape[1], self.degree
+        points = self.rate.shape[1]
+        degree = self.degree
         shared = _shared_cells(points, degree)
         # Nodes near a zero of r need cells that shrink towards it.
         near_zero = np.isfinite(self.rate).all(axis=1) & (self.rate <= 0).any(axis=1)

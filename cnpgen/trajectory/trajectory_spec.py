@@ -6,7 +6,8 @@ from dataclasses import dataclass
 from cnpgen.schema.keys import field
 
 # Tables of splines grow with degree x points^2: these take 0.15 GB.
-MAX_DEGREE, MAX_CONTROL_POINTS = 20, 500
+MAX_DEGREE = 20
+MAX_CONTROL_POINTS = 500
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -353,7 +353,8 @@ def _check_recipes(findings: _Findings) -> str:
         from cnpgen.problems.load_robot import load_robot
         from cnpgen.schema.catalogue import list_recipes, recipes_root
 
-        names, missing = list(list_recipes("dataset")), []
+        names = list(list_recipes("dataset"))
+        missing = []
         for name in names:
             try:
                 load_robot(load_dataset_recipe(name).pipeline.problem)

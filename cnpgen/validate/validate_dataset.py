@@ -66,7 +66,8 @@ def regenerate_blocks(
     dataset = StoredDataset(folder, spec, None)
     # Other blocks at each call: repeated checks cover more of the dataset.
     chosen = np.random.default_rng().permutation(len(blocks))[:count]
-    identical, findings = 0, []
+    identical = 0
+    findings = []
     with restored(spec) as recipe:
         prepared = prepare(Job(folder, spec, recipe.pipeline, backend, cache_folder))
         if prepared.block_rows != size:
@@ -289,7 +290,8 @@ def validate_dataset(
     # A damaged shard is a finding already; HDF5 may hang on it.
     undamaged = [task for task in existing if task.file not in damaged]
     findings += check_recipe(spec)
-    checked, again = DeepCheck(), Regeneration()
+    checked = DeepCheck()
+    again = Regeneration()
     if deep:
         findings += check_statistics(folder, spec)
         checked = check_rows(folder, spec, undamaged, machine_engine, progress)

@@ -55,7 +55,8 @@ def check_rows(
 
     Report the rows of every shard that was read.
     """
-    checks, findings = [], []
+    checks = []
+    findings = []
     with assembled(engine, len(tasks)) as pool:
         verify = partial(
             _verify_shard, folder.absolute() if pool.is_remote else folder, spec
@@ -260,10 +261,8 @@ def _agree(a: FieldStatistics, b: FieldStatistics) -> bool:
     # Sums of n numbers up to s in size round relative to n s, their squares relative to
     # n s^2.
     spread = np.maximum(np.abs(a.minimum), np.abs(a.maximum))
-    mean, m2 = (
-        MAX_RELATIVE_SUM_ERROR * spread,
-        MAX_RELATIVE_SUM_ERROR * a.count * spread**2,
-    )
+    mean = MAX_RELATIVE_SUM_ERROR * spread
+    m2 = MAX_RELATIVE_SUM_ERROR * a.count * spread**2
     return bool(
         (np.abs(a.mean - b.mean) <= mean).all() and (np.abs(a.m2 - b.m2) <= m2).all()
     )

@@ -143,11 +143,10 @@ class CertifiedDistance:
 
         self._requests = [coal.DistanceRequest() for _ in GJK_EPA_TOLERANCES]
         for request, (gjk, epa) in zip(self._requests, GJK_EPA_TOLERANCES, strict=True):
-            request.gjk_tolerance, request.epa_tolerance = gjk, epa
-        self._result, self._transforms = (
-            coal.DistanceResult(),
-            (coal.Transform3s(), coal.Transform3s()),
-        )
+            request.gjk_tolerance = gjk
+            request.epa_tolerance = epa
+        self._result = coal.DistanceResult()
+        self._transforms = (coal.Transform3s(), coal.Transform3s())
 
     def between(
         self, a: ConvexBody, pose_a: Pose, b: ConvexBody, pose_b: Pose
@@ -166,7 +165,8 @@ class CertifiedDistance:
         ):
             transform.setRotation(rotation)
             transform.setTranslation(origin)
-        best, normal = -np.inf, np.full(3, np.nan)
+        best = -np.inf
+        normal = np.full(3, np.nan)
         # From the strictest to the loosest tolerances, until one result agrees with its
         # certificate.
         for request in self._requests:
@@ -185,7 +185,8 @@ class CertifiedDistance:
             certified = -b.support(pose_b, -direction) - a.support(pose_a, direction)
             if certified > best:
                 # False for nan, which means that there is no direction
-                best, normal = certified, direction
+                best = certified
+                normal = direction
             if abs(measured - a.radius - b.radius - certified) <= MAX_CERTIFICATE_GAP_M:
                 break
         return best, normal

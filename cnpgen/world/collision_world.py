@@ -38,11 +38,10 @@ class CollisionWorld:
     def __init__(self, object_size: tuple[float, float, float] | None) -> None:
         import coal
 
-        self._request, self._result = coal.DistanceRequest(), coal.DistanceResult()
-        self._request.gjk_tolerance, self._request.epa_tolerance = (
-            GJK_TOLERANCE,
-            EPA_TOLERANCE,
-        )
+        self._request = coal.DistanceRequest()
+        self._result = coal.DistanceResult()
+        self._request.gjk_tolerance = GJK_TOLERANCE
+        self._request.epa_tolerance = EPA_TOLERANCE
         self._certified = CertifiedDistance()
         self._capsule = coal.Capsule(0.0, 1.0)
         self._object = (
@@ -51,12 +50,11 @@ class CollisionWorld:
             else ConvexBody(CUBE * np.array(object_size), 0.0, coal.Box(*object_size))
         )
         self._transform = coal.Transform3s()
-        self._solids, self._bodies, self._transforms = (
-            list[Solid](),
-            list[ConvexBody | None](),
-            list[Any](),
-        )
-        self._from_capsule, self._from_object = list[Any](), list[Any]()
+        self._solids = list[Solid]()
+        self._bodies = list[ConvexBody | None]()
+        self._transforms = list[Any]()
+        self._from_capsule = list[Any]()
+        self._from_object = list[Any]()
 
     def place(self, solids: Sequence[Solid]) -> None:
         """Set the obstacles."""
@@ -130,7 +128,8 @@ class CollisionWorld:
         self._place(ConvexBody(length * _AXIS, 0.0, self._capsule), pose)
 
     def _place(self, mover: ConvexBody, pose: Pose) -> None:
-        self._mover, self._pose = mover, pose
+        self._mover = mover
+        self._pose = pose
         self._transform.setRotation(pose[0])
         self._transform.setTranslation(pose[1])
 
@@ -167,7 +166,8 @@ class CollisionWorld:
         return [self._distance(measures, obstacle) for obstacle in range(len(measures))]
 
     def _distance(self, measures: list[Any], obstacle: int) -> float:
-        measure, body = measures[obstacle], self._bodies[obstacle]
+        measure = measures[obstacle]
+        body = self._bodies[obstacle]
         if body is not None:
             pose = np.eye(3), self._solids[obstacle].position
             distance, self._normal = self._certified.between(

@@ -36,7 +36,8 @@ def friction_bounds(drive: Drive, dq: Array) -> tuple[Array, Array]:
 
 def _highest_friction(drive: Drive, dq: Array) -> Array:
     _, viscous, dry = _terms(drive, dq)
-    width, share = drive.reversal_speed, drive.friction_help
+    width = drive.reversal_speed
+    share = drive.friction_help
     x = np.clip(dq / width + 1, 0.0, 1.0)
     # Quintic step S from 0 to 1 over [-w, 0], and its bounds of the friction of either
     # sign.

@@ -15,7 +15,8 @@ if TYPE_CHECKING:
     import pinocchio as pin
 
 # Rows of a joint's coefficients: its origin, and its direction if it slides.
-_ORIGIN, _SLIDE = 3, 7
+_ORIGIN = 3
+_SLIDE = 7
 # Between our poses and Pinocchio's, relative to 1 + the largest joint position.
 MAX_POSE_ERROR = 1e-9
 
@@ -24,7 +25,8 @@ class ForwardKinematics:
     """The forward kinematics of a model with revolute and prismatic joints only."""
 
     def __init__(self, model: "pin.Model") -> None:
-        self._model, self._data = model, model.createData()
+        self._model = model
+        self._data = model.createData()
         self._parents = list(model.parents)[1:]
         self._coefficients = [
             _coefficients(model, joint) for joint in range(1, model.njoints)
@@ -57,10 +59,8 @@ class ForwardKinematics:
         frames[0] = np.eye(4, 3)[..., None]
         # Reused for all joints: allocating new pages dominates the run time.
         products = np.empty((12, 3 * count))
-        constant, moving = (
-            products[:4].reshape(4, 3, count),
-            products[4:].reshape(2, 4, 3, count),
-        )
+        constant = products[:4].reshape(4, 3, count)
+        moving = products[4:].reshape(2, 4, 3, count)
         for joint, (parent, coefficients) in enumerate(
             zip(self._parents, self._coefficients, strict=True), 1
         ):
@@ -101,7 +101,8 @@ class ForwardKinematics:
 
         # An error of the model would show at any state; three are enough.
         checked = [0, q.shape[1] // 2, -1]
-        states, poses = q[:, checked].T.copy(), frames[-1][..., checked]
+        states = q[:, checked].T.copy()
+        poses = frames[-1][..., checked]
         expected = np.empty((len(states), 3, 4))
         for pose, state in zip(expected, states, strict=True):
             pin.forwardKinematics(self._model, self._data, state)
@@ -131,7 +132,8 @@ def _coefficients(model: "pin.Model", joint: int) -> Array:
     x, y, z = motion[3:]
     cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
     # Rodrigues' formula R = I + [a]x^2 + sin(q) [a]x - cos(q) [a]x^2 for a unit axis a.
-    placement, rows = model.jointPlacements[joint], np.zeros((12, 4))
+    placement = model.jointPlacements[joint]
+    rows = np.zeros((12, 4))
     terms = [np.eye(3) + cross @ cross, cross, -cross @ cross]  # Rodrigues' formula
     rows.reshape(3, 4, 4)[:, :3, :3] = [(placement.rotation @ term).T for term in terms]
     rows[_ORIGIN] = [*placement.translation, 1.0]

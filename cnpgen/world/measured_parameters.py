@@ -35,7 +35,8 @@ class MeasuredParameters:
         self.values: dict[str, float] = robot.parameters.split(
             np.empty(0), robot.nominal_parameters
         )[1]
-        self._turn, self._origin = np.eye(3), np.zeros(3)
+        self._turn = np.eye(3)
+        self._origin = np.zeros(3)
         self._upright = np.eye(3)
         self._load: tuple[int, pin.Inertia, pin.SE3] | None = None
         if self.changes_payload:

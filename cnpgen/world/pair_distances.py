@@ -86,7 +86,8 @@ class PairDistances:
             distance, which are then lower bounds.
         """
         # Start from the lower bounds: only states that may be the closest are measured.
-        distances, best = self.bounds[pairs], np.inf
+        distances = self.bounds[pairs]
+        best = np.inf
         measured: dict[tuple[int, int], float] = {}
         while distances.size:
             index, k = divmod(int(distances.argmin()), distances.shape[1])
@@ -96,7 +97,8 @@ class PairDistances:
             measured[index, k] = distance
             if math.isnan(distance):
                 break
-            distances[index, k], best = distance, min(best, distance)
+            distances[index, k] = distance
+            best = min(best, distance)
             closer = np.flatnonzero(distances[index] < best)
             if len(closer) and np.isfinite(direction).all():
                 raised = self.separation(pairs[index], direction, closer)
@@ -128,7 +130,8 @@ class PairDistances:
         for pair in np.flatnonzero(~proven.all(axis=1)).tolist():
             unresolved = np.flatnonzero(clear & ~proven[pair])
             while len(unresolved):
-                k, unresolved = int(unresolved[0]), unresolved[1:]
+                k = int(unresolved[0])
+                unresolved = unresolved[1:]
                 distance, direction = self.measure(pair, k)
                 clear[k] = distance >= min_distance
                 if len(unresolved) and np.isfinite(direction).all():
@@ -144,7 +147,8 @@ class PairDistances:
             Distances [m] and indices of their pairs, shape (K,) each.
         """
         count = self.bounds.shape[1]
-        distances, closest = np.full(count, np.inf), np.zeros(count, np.intp)
+        distances = np.full(count, np.inf)
+        closest = np.zeros(count, np.intp)
         # In the order of the bounds, the search ends at the first bound above the best
         # distance.
         order = np.argsort(self.bounds, axis=0)
@@ -154,7 +158,8 @@ class PairDistances:
                     break
                 distance, _ = self.measure(pair, k)
                 if distance < distances[k]:
-                    distances[k], closest[k] = distance, pair
+                    distances[k] = distance
+                    closest[k] = pair
         return distances, closest
 
     def closest_points(self, radius: float = 0.0) -> ClosestPoints:
@@ -162,7 +167,8 @@ class PairDistances:
 
         A radius [m] extends the first bodies.
         """
-        certified, points = CertifiedDistance(), list[tuple[Array, Array]]()
+        certified = CertifiedDistance()
+        points = list[tuple[Array, Array]]()
         distance, closest = self.smallest_per_state()
         for k, pair in enumerate(closest.tolist()):
             (a, pose_a), (b, pose_b) = self.bodies(pair, k)

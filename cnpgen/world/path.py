@@ -48,9 +48,11 @@ class PathWorld(RobotWorld[Array]):
         self._kinematics = ForwardKinematics(self._model)
         self._pool = pin.ModelPool(self._model, 1)
         frame = self._model.frames[self._tip]
-        self._carrier, tip = frame.parentJoint, frame.placement.homogeneous
+        self._carrier = frame.parentJoint
+        tip = frame.placement.homogeneous
         # T_joint_tip is constant, so the tip follows from the joint that carries it.
-        self._turn, self._offset = tip[:3, :3], tip[:3, 3].copy()
+        self._turn = tip[:3, :3]
+        self._offset = tip[:3, 3].copy()
         self._segment_ends = np.array(self.robot.capsule_axes, np.int64).reshape(-1, 2)
         rest = np.zeros((self.robot.n, 1))
         self.set_path(
@@ -83,7 +85,11 @@ class PathWorld(RobotWorld[Array]):
         """
         import pinocchio as pin
 
-        self.q, self.dq, self.ddq, self.jerk, self._exact = q, dq, ddq, jerk, exact
+        self.q = q
+        self.dq = dq
+        self.ddq = ddq
+        self.jerk = jerk
+        self._exact = exact
         for name in _CACHED:
             self.__dict__.pop(name, None)
         self._place(obstacle_poses)
@@ -152,12 +158,10 @@ class PathWorld(RobotWorld[Array]):
         """Compute the velocity [m/s] and acceleration [m/s^2] of the tip at one state, shape (3,) each."""
         import pinocchio as pin
 
-        model, data, tip, frame = (
-            self._model,
-            self._data,
-            self._tip,
-            pin.ReferenceFrame.LOCAL_WORLD_ALIGNED,
-        )
+        model = self._model
+        data = self._data
+        tip = self._tip
+        frame = pin.ReferenceFrame.LOCAL_WORLD_ALIGNED
         pin.forwardKinematics(model, data, q, dq, ddq)
         velocity = np.array(pin.getFrameVelocity(model, data, tip, frame).linear)
         return velocity, np.array(
@@ -207,7 +211,8 @@ class PathWorld(RobotWorld[Array]):
         )
 
     def _from_segments(self) -> PairDistances:
-        segments, solids = self.segments(), self._solids
+        segments = self.segments()
+        solids = self._solids
         # Boxes around segments: their bounds need no call of Coal.
         pairs = [(segment, solid) for segment in segments for solid in solids]
         low, high = (
@@ -232,8 +237,10 @@ class PathWorld(RobotWorld[Array]):
         return PairDistances(bounds, measure, separation_along, bodies_at)
 
     def _from_object(self) -> PairDistances:
-        position, rotation = self.tip_position, self.tip_rotation
-        size, solids = self._require_object(), self._solids
+        position = self.tip_position
+        rotation = self.tip_rotation
+        size = self._require_object()
+        solids = self._solids
 
         def measure(pair: int, k: int) -> tuple[float, Array]:
             return self._collisions.object_distance(
@@ -296,10 +303,8 @@ class PathWorld(RobotWorld[Array]):
             RecipeError: The problem has no held object.
         """
         offsets = CUBE * self._require_object()
-        rotation, position = (
-            self.tip_rotation[..., states],
-            self.tip_position[:, states],
-        )
+        rotation = self.tip_rotation[..., states]
+        position = self.tip_position[:, states]
         return np.asarray(np.tensordot(offsets, rotation, axes=(1, 1)) + position)
 
     def segments(self) -> Array:

@@ -78,15 +78,12 @@ class PoseKinematics:
     def __init__(self, robot: Robot, frame: int | None = None) -> None:
         model = robot.model
         placed = model.frames[robot.tip_frame if frame is None else frame]
-        self.robot, self._carrier = robot, placed.parentJoint
-        self._turn, self._offset = (
-            np.array(placed.placement.rotation),
-            np.array(placed.placement.translation),
-        )
-        self._kinematics, self._joints = (
-            ForwardKinematics(model),
-            list(model.supports[self._carrier])[1:],
-        )
+        self.robot = robot
+        self._carrier = placed.parentJoint
+        self._turn = np.array(placed.placement.rotation)
+        self._offset = np.array(placed.placement.translation)
+        self._kinematics = ForwardKinematics(model)
+        self._joints = list(model.supports[self._carrier])[1:]
         self._motions = [
             joint_motion(model, joint) for joint in range(1, model.njoints)
         ]
@@ -135,19 +132,20 @@ def solve_pose_ik(
         that have their pose, shape (K,).
     """
     robot = kinematics.robot
-    low, high = robot.position_lower[:, None], robot.position_upper[:, None]
+    low = robot.position_lower[:, None]
+    high = robot.position_upper[:, None]
     q = np.clip(seeds, low, high)
     for step in range(MAX_POSE_STEPS + 1):
         position, rotation, J = kinematics.evaluate(q)
-        place, facing, free = positions, rotations, None
+        place = positions
+        facing = rotations
+        free = None
         if tolerance is not None:
             place, facing, free = tolerance.nearest(
                 positions, rotations, (position, rotation)
             )
-        shift, turn = (
-            place - position,
-            rotation_vectors(facing @ rotation.swapaxes(1, 2)),
-        )
+        shift = place - position
+        turn = rotation_vectors(facing @ rotation.swapaxes(1, 2))
         # Both parts of the pose must be met; the search of the other states goes on.
         met = np.linalg.norm(shift, axis=1) <= POSE_POSITION_TOLERANCE_M
         met &= np.linalg.norm(turn, axis=1) <= POSE_ROTATION_TOLERANCE_RAD
@@ -179,7 +177,8 @@ def _without_free(
     error: Array, J: Array, rotations: Array, free: NDArray[np.bool_]
 ) -> tuple[Array, Array]:
     """Return errors (K, 6) and Jacobians in the axes of the wanted poses, zero in free directions (K, 6)."""
-    back, count = rotations.swapaxes(1, 2)[:, None], len(error)
+    back = rotations.swapaxes(1, 2)[:, None]
+    count = len(error)
     turned = (back @ error.reshape(count, 2, 3, 1)).reshape(count, 6)
     rows = (back @ J.reshape(count, 2, 3, -1)).reshape(J.shape)
     return np.where(free, 0.0, turned), np.where(free[..., None], 0.0, rows)

@@ -39,11 +39,10 @@ class RigidBodies:
     """
 
     def __init__(self, shape: Shape, n_obstacles: int, n_joints: int) -> None:
-        parts, n_parts = shape.convex_parts, len(shape.convex_parts)
-        self._bodies, self._solids = (
-            [convex_body(part.vertices, part.radius) for part in parts],
-            list[Solid](),
-        )
+        parts = shape.convex_parts
+        n_parts = len(shape.convex_parts)
+        self._bodies = [convex_body(part.vertices, part.radius) for part in parts]
+        self._solids = list[Solid]()
         # Obstacles have frames after those of the joints, with the axes of the world.
         self._frames = [shape.joints[part.link] for part in parts] + [
             n_joints + 1 + i for i in range(n_obstacles)
@@ -162,7 +161,8 @@ class RigidBodies:
 
         The direction points from a to b, in the frame of a.
         """
-        first, second = self._placed(a, k), self._placed(b, k)
+        first = self._placed(a, k)
+        second = self._placed(b, k)
         distance, normal = self._certified.between(*first, *second)
         return distance, normal @ first[1][0]
 
@@ -179,20 +179,16 @@ class RigidBodies:
             (self._bodies[a], self._bodies[b]),
             (self._frames[a], self._frames[b]),
         )
-        rotation, between = (
-            self._rotations[other],
-            self._positions[other] - self._positions[frame],
-        )
+        rotation = self._rotations[other]
+        between = self._positions[other] - self._positions[frame]
         if a >= len(self._balls):
             # An obstacle, whose frame has the axes of the world.
             in_b = (direction @ rotation.reshape(3, -1)).reshape(3, -1)
             shift = direction @ between
         else:
             along = direction @ self._rotations[frame]
-            in_b, shift = (
-                np.einsum("ijk,ik->jk", rotation, along),
-                np.einsum("ik,ik->k", along, between),
-            )
+            in_b = np.einsum("ijk,ik->jk", rotation, along)
+            shift = np.einsum("ik,ik->k", along, between)
         # Along u: min over b of u . x - max over a of u . x, both with their radii.
         reach = float((first.corners @ direction).max()) + first.radius + second.radius
         return np.asarray(

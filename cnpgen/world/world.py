@@ -55,12 +55,15 @@ class RobotWorld(ABC, Generic[Value]):
         obstacles: Sequence[Obstacle] = (),
         object_size: tuple[float, float, float] | None = None,
     ) -> None:
-        self.robot, self.obstacles = robot, tuple(obstacles)
+        self.robot = robot
+        self.obstacles = tuple(obstacles)
         self.parameters = MeasuredParameters(robot)
         self._model = self.parameters.model
-        self._data, self._tip = self._model.createData(), robot.tip_frame
+        self._data = self._model.createData()
+        self._tip = robot.tip_frame
         self._object_size = None if object_size is None else np.array(object_size)
-        self._collisions, self._solids = CollisionWorld(object_size), list[Solid]()
+        self._collisions = CollisionWorld(object_size)
+        self._solids = list[Solid]()
         self._bodies = (
             None
             if robot.shape is None
@@ -176,13 +179,13 @@ class RobotWorld(ABC, Generic[Value]):
 
     def _place(self, obstacle_poses: Array) -> None:
         """Take the poses of the obstacles, unless they stand there already, and discard the distances of the states."""
-        self._pairs, self._placed = dict[str, PairDistances](), False
-        poses, values = (
-            obstacle_poses[: self._pose_width],
-            obstacle_poses[self._pose_width :],
-        )
+        self._pairs = dict[str, PairDistances]()
+        self._placed = False
+        poses = obstacle_poses[: self._pose_width]
+        values = obstacle_poses[self._pose_width :]
         if self._poses is None or not np.array_equal(poses, self._poses):
-            self._poses, copied = None, poses.copy()
+            self._poses = None
+            copied = poses.copy()
             self._solids = solids_of(self.obstacles, copied)
             self._collisions.place(self._solids)
             # Last: after an error the obstacles are placed again.
@@ -272,7 +275,10 @@ class World(RobotWorld[float]):
         """
         import pinocchio as pin
 
-        self.q, self.dq, self.ddq, self.jerk = q, dq, ddq, jerk
+        self.q = q
+        self.dq = dq
+        self.ddq = ddq
+        self.jerk = jerk
         pin.forwardKinematics(self._model, self._data, q, dq, ddq)
         self._T_world_tip = pin.updateFramePlacement(self._model, self._data, self._tip)
         self._place(obstacle_poses)

@@ -138,10 +138,12 @@ def execution_of(task: Task, plant: Plant) -> Execution:
 
 def joined(prefix: ExecutedPrefix, states: StatesAt) -> StatesAt:
     """Join the prefix of one motion with its continuation, whose time starts at 0."""
-    first, until = states_of(prefix.motion), float(prefix.until[0])
+    first = states_of(prefix.motion)
+    until = float(prefix.until[0])
 
     def at(t: Array) -> tuple[Array, Array, Array]:
-        before, after = first(np.minimum(t, until)), states(np.maximum(t - until, 0.0))
+        before = first(np.minimum(t, until))
+        after = states(np.maximum(t - until, 0.0))
         q, dq, ddq = (
             np.where((t < until)[:, None], a, b)
             for a, b in zip(before, after, strict=True)

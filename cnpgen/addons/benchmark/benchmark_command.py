@@ -216,7 +216,8 @@ def _run(arguments: argparse.Namespace, folder: Path) -> "Benchmark":
     from cnpgen.addons.benchmark.benchmark_options import BenchmarkOptions
     from cnpgen.addons.benchmark.run_suite import FASTEST, run_benchmark
 
-    meter, doing = Meter(noun="problem"), [""]
+    meter = Meter(noun="problem")
+    doing = [""]
     planners = {name for name, _, _ in arguments.set}
     parameters = {
         each: {key: value for name, key, value in arguments.set if name == each}
@@ -312,7 +313,8 @@ def _planners() -> tuple[dict[str, str], dict[str, str]]:
     from cnpgen.schema import registry
     from cnpgen.schema.keys import keys
 
-    planners, fields = dict[str, str](), dict[str, str]()
+    planners = dict[str, str]()
+    fields = dict[str, str]()
     for name in registry.names(PLANNERS):
         try:
             kind = load_kind(name)

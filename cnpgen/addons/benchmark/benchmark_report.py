@@ -95,7 +95,8 @@ def success_over_time(rows: list[Values], flag: str) -> tuple[Array, Array]:
 def success_figure(values: dict[str, list[Values]], plant: str) -> "Figure":
     """Draw the ratio of successful executions, or of valid plans without a plant, over the planning time."""
     figure = new_figure(4.5, 3.2)
-    axes, flag = figure.add_subplot(), "success" if plant else "valid"
+    axes = figure.add_subplot()
+    flag = "success" if plant else "valid"
     times_ms = [
         float(known.get("planning_cpu_ms", 0.0))
         for rows in values.values()
@@ -167,7 +168,8 @@ def save_benchmark_report(
     Raises:
         MachineError: matplotlib is missing, or the file cannot be written.
     """
-    suite, place = benchmark.suite, Path(path)
+    suite = benchmark.suite
+    place = Path(path)
     parts = [
         f"<h1>{escape(suite.name)} {suite.version}</h1><p>{escape(suite.title)}: {len(benchmark.problems)} problems</p>"
     ]
@@ -208,7 +210,8 @@ def _motions(benchmark: Benchmark, *, video: bool) -> list[str]:
     """Render one executable plan of each planner, if this machine can render: of the same problem if all have one."""
     if not benchmark.plants:
         return []
-    parts, plant = [], benchmark.plants[0]
+    parts = []
+    plant = benchmark.plants[0]
     executed = {
         name: [row for row in rows if _was_executed(row, plant.name)]
         for name, rows in benchmark.results.items()
@@ -249,9 +252,11 @@ def _render(task: Task, plant: Plant, *, video: bool) -> tuple[str, str]:
     """Execute a plan; return an image or a film, and its caption."""
     execution = execution_of(task, plant)
     with tempfile.TemporaryDirectory() as folder:
-        picture, film = Path(folder) / "end.png", Path(folder) / "plan.mp4"
+        picture = Path(folder) / "end.png"
+        film = Path(folder) / "plan.mp4"
         save_picture(picture, execution)
-        image, caption = _embedded(picture, "image/png"), "at the end of its plan"
+        image = _embedded(picture, "image/png")
+        caption = "at the end of its plan"
         if video:
             try:
                 save_film(film, execution, max_frames=MAX_FILM_FRAMES)

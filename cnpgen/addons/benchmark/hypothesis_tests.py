@@ -98,7 +98,8 @@ def _values_of_verdict(verdict: Mapping[str, Any] | None) -> Values:
     """Return the flags and figures of a plan; without a plan, it is not valid."""
     if verdict is None:
         return {"valid": False, "paper_valid": False, "paper_finished": False}
-    metrics, paper = verdict["metrics"], verdict["paper"]
+    metrics = verdict["metrics"]
+    paper = verdict["paper"]
     values: Values = {
         "valid": verdict["valid"],
         "paper_valid": paper["valid"],
@@ -170,7 +171,8 @@ Keyed = Mapping[tuple[int, int], Values]
 
 
 def _ratio(key: str, rows: Keyed, others: Keyed) -> dict[str, Any]:
-    count, of = sum(bool(known.get(key, False)) for known in rows.values()), len(rows)
+    count = sum(bool(known.get(key, False)) for known in rows.values())
+    of = len(rows)
     mine, theirs = (
         _means({at: {key: known.get(key, False)} for at, known in part.items()}, key)
         for part in (rows, others)
@@ -271,7 +273,8 @@ def mcnemar(mine: Any, theirs: Any) -> float:
     """Return the p-value of McNemar's exact test of two masks of solved problems, shape (N,) each."""
     from scipy.stats import binomtest
 
-    only_mine, only_theirs = int(np.sum(mine & ~theirs)), int(np.sum(theirs & ~mine))
+    only_mine = int(np.sum(mine & ~theirs))
+    only_theirs = int(np.sum(theirs & ~mine))
     # Problems that both or none solve say nothing about a difference.
     both = only_mine + only_theirs
     return float(binomtest(only_mine, both).pvalue) if both else 1.0

@@ -56,7 +56,8 @@ class PlannerProcess:
     """Planner in another process, which is restarted after it died or was stopped."""
 
     def __init__(self, name: str, setting: Setting) -> None:
-        self._name, self._setting = name, setting
+        self._name = name
+        self._setting = setting
         self._process: subprocess.Popen[bytes] | None = None
         self._pipe: Connection | None = None
         self._unprepared: PlanningOutcome | None = None
@@ -70,7 +71,8 @@ class PlannerProcess:
         assert self._pipe is not None
         assert self._process is not None
         # A stopped planner reports nothing, so its times are measured from here, too.
-        start, used = time.perf_counter(), cpu_time_of(self._process.pid)
+        start = time.perf_counter()
+        used = cpu_time_of(self._process.pid)
         try:
             self._pipe.send(problem)
             # Planners may end a little after their limit; their answer then does not
@@ -84,10 +86,8 @@ class PlannerProcess:
                 seconds=time.perf_counter() - start,
                 error="its process ended",
             )
-        seconds, used = (
-            time.perf_counter() - start,
-            cpu_time_of(self._process.pid) - used,
-        )
+        seconds = time.perf_counter() - start
+        used = cpu_time_of(self._process.pid) - used
         self.stop()
         return PlanningOutcome(
             Ending.OUT_OF_TIME, None, seconds, used, "stopped: no answer"
@@ -131,11 +131,9 @@ class PlannerProcess:
                 stdout=STDERR,
                 start_new_session=True,
             )
-        refuses, lacks, message = (
-            False,
-            False,
-            "its process ended or was not ready in time",
-        )
+        refuses = False
+        lacks = False
+        message = "its process ended or was not ready in time"
         with suppress(EOFError, OSError):
             self._pipe.send((self._name, self._setting))
             if self._pipe.poll(MAX_PREPARATION_TIME_S):
@@ -201,10 +199,8 @@ def serve(descriptor: int) -> None:
         try:
             plan = load_planner(name, setting.parameters).prepare(setting)
         except Exception as error:  # noqa: BLE001 - a plug-in may raise any exception
-            refuses, lacks = (
-                isinstance(error, CnpgenError),
-                isinstance(error, MachineError),
-            )
+            refuses = isinstance(error, CnpgenError)
+            lacks = isinstance(error, MachineError)
             pipe.send((refuses, lacks, _message(error)))
             return
         pipe.send((False, False, ""))
@@ -214,15 +210,18 @@ def serve(descriptor: int) -> None:
 
 def _plan_once(plan: Plan, problem: Plans) -> PlanningOutcome:
     """Plan for one problem and measure the time."""
-    start, cpu = time.perf_counter(), _cpu_time()
+    start = time.perf_counter()
+    cpu = _cpu_time()
     try:
         # Times begin once the number of threads is set, which takes time itself.
         with one_thread():
-            start, cpu = time.perf_counter(), _cpu_time()
+            start = time.perf_counter()
+            cpu = _cpu_time()
             try:
                 answer = plan(problem)
             finally:
-                seconds, cpu = time.perf_counter() - start, _cpu_time() - cpu
+                seconds = time.perf_counter() - start
+                cpu = _cpu_time() - cpu
         content = _content(answer, problem)
     except Exception as error:  # noqa: BLE001 - a plug-in may raise any exception
         return PlanningOutcome(Ending.FAILED, None, seconds, cpu, _message(error))

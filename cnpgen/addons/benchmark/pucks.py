@@ -64,10 +64,8 @@ class Pucks:
 
     def positions(self) -> Array:
         """Place the pucks [m], shape (2, columns x rows), y fastest."""
-        x, y = (
-            np.linspace(self.x.low, self.x.high, self.columns),
-            np.linspace(self.y.low, self.y.high, self.rows),
-        )
+        x = np.linspace(self.x.low, self.x.high, self.columns)
+        y = np.linspace(self.y.low, self.y.high, self.rows)
         return np.stack(np.meshgrid(x, y, indexing="ij")).reshape(2, -1)
 
 
@@ -182,7 +180,8 @@ def scenario_problems(scenario: ReplanningScenario) -> tuple[Plans, ExecutedPref
             raise RecipeError([f"replanning.switch_times: {text}"])
         # The second motion starts from the states of the first ones at the switch.
         problems.append(hits_from(scenario.pucks, opposite, first.states_at(time)))
-    joined, prefix = concatenate(problems), concatenate([first] * len(problems)).motion
+    joined = concatenate(problems)
+    prefix = concatenate([first] * len(problems)).motion
     until = np.repeat(scenario.switch_times, len(first))
     # Every switch of every first motion is a problem of its own.
     return replace(joined, sample_id=np.arange(len(joined))), ExecutedPrefix(

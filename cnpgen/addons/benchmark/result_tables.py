@@ -235,7 +235,8 @@ def failure_summaries(benchmark: Benchmark) -> list[str]:
 
 def csv_text(benchmark: Benchmark) -> str:
     """Write all results as CSV: a head, then a row per planner, repetition, problem and plant."""
-    suite, seed = benchmark.suite, benchmark.runs[-1].seed if benchmark.runs else 0
+    suite = benchmark.suite
+    seed = benchmark.runs[-1].seed if benchmark.runs else 0
     plants = [name for name in benchmark.executions if name]
     text = io.StringIO()
     columns = (*flags_of(benchmark), *FIGURES)

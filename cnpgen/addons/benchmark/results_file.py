@@ -134,7 +134,8 @@ def open_results(
 
 def _differences(line: str, head: str) -> str:
     """Name the keys in which two heads differ."""
-    one, other = json.loads(line), json.loads(head)
+    one = json.loads(line)
+    other = json.loads(head)
     if not isinstance(one, dict):
         return "it has no head"
     # A digest says nothing to a reader; the other keys name the difference.

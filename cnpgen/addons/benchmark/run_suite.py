@@ -176,7 +176,8 @@ def run_benchmark(
     problems, prefix = loaded.problems(n)
     if chosen.environment is not None:
         check_challenge(*open_problem(problems.problem))
-    limit, seed = float(chosen.time_limit), int(chosen.seed)
+    limit = float(chosen.time_limit)
+    seed = int(chosen.seed)
     setting = Setting(problems.problem, loaded.model, limit, seed)
     place = ResultsFolder(Path(folder), loaded, setting)
     names = {*place.planners(delete_others=force), *planners}
@@ -286,8 +287,10 @@ class _BenchmarkRun:
         self, suite: Suite, planners: Sequence[str], runs: tuple[RunRecord, ...]
     ) -> Benchmark:
         """Return the results of this run and of earlier ones, those of the given planners first."""
-        rows, options = self.place.rows(planners), self.options
-        problems, prefix = self.problems, self.prefix
+        rows = self.place.rows(planners)
+        options = self.options
+        problems = self.problems
+        prefix = self.prefix
         # The folder may have results of more problems than this run.
         count = max((row["problem"] + 1 for row in chain(*rows.values())), default=0)
         if count > len(problems):
@@ -304,7 +307,8 @@ class _BenchmarkRun:
 
     def plan(self, results: Results, name: str, setting: Setting) -> None:
         """Plan for the problems without result."""
-        total, indices = len(self.problems), results.missing(len(self.problems))
+        total = len(self.problems)
+        indices = results.missing(len(self.problems))
         waiting = [(index, self.problems[index]) for index in indices]
         if not waiting:
             return
@@ -326,10 +330,8 @@ class _BenchmarkRun:
         waiting = list(results.unexecuted(plant.name, len(self.problems)))
         if not waiting:
             return
-        prefix, activity = (
-            self.prefix,
-            f"{self._label(name, repetition)}, {plant.name} plant",
-        )
+        prefix = self.prefix
+        activity = f"{self._label(name, repetition)}, {plant.name} plant"
         tasks = (
             (
                 self.problems[index],

@@ -136,7 +136,8 @@ def run(arguments: argparse.Namespace) -> int:
 
 def _text(file: Path, found: "Simulation") -> str:
     """Lay out what came of all plans together."""
-    summary, count = found.summary(), len(found.executed)
+    summary = found.summary()
+    count = len(found.executed)
     head = f"{file}: {counted(count, 'plan')} of {found.plans.problem.name}, executed by the {found.plant.name} plant"
     counts = {text: summary[name] for name, text in _NAMES.items() if name in summary}
     tallies = [

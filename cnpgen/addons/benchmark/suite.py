@@ -158,7 +158,8 @@ def _read_planners(
     tables: Any, where: RecipeLocation, errors: list[str]
 ) -> PlannerFields | None:
     """Return the fields of planners after checking them."""
-    before, known = len(errors), registry.names(PLANNERS)
+    before = len(errors)
+    known = registry.names(PLANNERS)
     if not isinstance(tables, dict):
         errors.append(
             where.message(f"expected a table per planner, got {show(tables)}")
@@ -199,10 +200,8 @@ def _read(path: Path, errors: list[str]) -> Suite | None:
         Suite, table, where=RecipeLocation(str(path)), errors=errors, readers=readers
     )
     if suite is not None and suite.scenes is not None:
-        file, robot = (
-            str(path.parent / suite.scenes.file),
-            _beside(path.parent, suite.scenes.robot),
-        )
+        file = str(path.parent / suite.scenes.file)
+        robot = _beside(path.parent, suite.scenes.robot)
         return replace(suite, scenes=SceneFileProblems(file=file, robot=robot))
     if suite is not None and suite.samples is not None:
         return replace(

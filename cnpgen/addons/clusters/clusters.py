@@ -52,7 +52,8 @@ class Cluster(ABC):
     is_remote = True
 
     def __init__(self, name: str, workers: int | None) -> None:
-        self._name, self._workers = name, workers
+        self._name = name
+        self._workers = workers
 
     @property
     def size(self) -> int:
@@ -73,7 +74,8 @@ class Cluster(ABC):
             MachineError: A task has crashed several workers, or the connection to the
                 cluster is lost.
         """
-        submit, left = self.prepared(function), enumerate(tasks)
+        submit = self.prepared(function)
+        left = enumerate(tasks)
         under_way: dict[Any, int] = {}
         results: dict[int, R] = {}
         following = 0
@@ -97,10 +99,12 @@ class Cluster(ABC):
 
     def _wait(self, tickets: Sequence[Any]) -> Sequence[Any]:
         """Wait until some tasks are finished; log a warning if there is no worker."""
-        idle_since, warn_after = time.monotonic(), FIRST_WARNING_S
+        idle_since = time.monotonic()
+        warn_after = FIRST_WARNING_S
         while not (finished := self.finished(tickets, POLL_INTERVAL_S)):
             if self.present():
-                idle_since, warn_after = time.monotonic(), FIRST_WARNING_S
+                idle_since = time.monotonic()
+                warn_after = FIRST_WARNING_S
             elif time.monotonic() - idle_since >= warn_after:
                 _LOG.warning(
                     "%s has had no worker for %.0f s; waiting for one",
@@ -440,7 +444,8 @@ def _check_reachable(address: str, what: str) -> None:
     found = re.search(r"(?:^|//)([^/]+):(\d+)$", address)
     if found is None:
         return
-    host, port = found.group(1).strip("[]"), int(found.group(2))
+    host = found.group(1).strip("[]")
+    port = int(found.group(2))
     try:
         socket.create_connection((host, port), timeout=CONNECTION_TIMEOUT_S).close()
     except OSError as error:

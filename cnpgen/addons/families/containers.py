@@ -65,16 +65,15 @@ class OpenBox(SceneFamily):
         _open_box(box, "box", (depth / 2, 0.0), bottom, (depth, width, height))
         floor = bottom + WALL_M
         for index in range(whole(random, self.objects)):
-            x, y = (
-                depth * random.uniform(0.25, 0.75),
-                width * (index - 0.5) * random.uniform(0.3, 0.6),
-            )
+            x = depth * random.uniform(0.25, 0.75)
+            y = width * (index - 0.5) * random.uniform(0.3, 0.6)
             box.cylinder(
                 f"object {index + 1}", (float(x), float(y), floor + 0.05), 0.03, 0.1
             )
             box.grasp((float(x), float(y), floor + 0.12), (0, 0, -1))
         for _ in range(6):
-            x, y = depth * random.uniform(0.3, 0.7), width * random.uniform(-0.25, 0.25)
+            x = depth * random.uniform(0.3, 0.7)
+            y = width * random.uniform(-0.25, 0.25)
             box.grasp(
                 (float(x), float(y), floor + float(random.uniform(0.06, 0.16))),
                 (0.15, 0, -1),
@@ -98,8 +97,10 @@ class Cage(SceneFamily):
     def draw(self, random: np.random.Generator) -> Layout:
         """Draw walls, bars and an object in the cage."""
         cage = place_furniture(random, self, uniform(random, self.bottom))
-        size, opening = uniform(random, self.size), uniform(random, self.opening)
-        thin, bar = 0.04, 0.04
+        size = uniform(random, self.size)
+        opening = uniform(random, self.opening)
+        thin = 0.04
+        bar = 0.04
         low = float(random.uniform(0.08, max(size - opening - 0.08, 0.1)))
         cage.box("floor", (size / 2, 0, 0), (size, size, thin))
         cage.box("roof", (size / 2, 0, size), (size, size, thin))
@@ -108,7 +109,8 @@ class Cage(SceneFamily):
         cage.box("back", (size, 0, size / 2), (thin, size - thin, size - thin))
         cage.box("bar below", (0, 0, low), (bar, size - thin, bar))
         cage.box("bar above", (0, 0, low + opening), (bar, size - thin, bar))
-        x, y = float(random.uniform(0.15, 0.3)), float(random.uniform(-0.15, 0.15))
+        x = float(random.uniform(0.15, 0.3))
+        y = float(random.uniform(-0.15, 0.15))
         cage.box("cube", (x, y, thin / 2 + 0.035), (0.07, 0.07, 0.07))
         cage.grasp((x - 0.06, y, 0.15), (1, 0, -0.6), tilt=0.4)
         for _ in range(5):
@@ -141,7 +143,8 @@ class Dresser(SceneFamily):
         )
         count = whole(random, self.drawers)
         lengths = [uniform(random, self.extension) for _ in range(count)]
-        body, total = 0.3, float(random.uniform(0.6, 0.9))
+        body = 0.3
+        total = float(random.uniform(0.6, 0.9))
         front = max(lengths)
         dresser.box("body", (front + body / 2, 0, total / 2), (body, 1.0, total))
         for index, extended in enumerate(lengths):

@@ -47,10 +47,8 @@ class FreeMix(SceneFamily):
         ]
         grasps = []
         for _ in range(10):
-            bearing, radius = (
-                uniform(random, self.bearing),
-                float(random.uniform(0.35, 0.65)),
-            )
+            bearing = uniform(random, self.bearing)
+            radius = float(random.uniform(0.35, 0.65))
             position = np.array(
                 [
                     radius * math.cos(bearing),
@@ -68,7 +66,8 @@ class FreeMix(SceneFamily):
 
     def _obstacle(self, random: np.random.Generator, index: int) -> Obstacle:
         a, b, c = (uniform(random, self.size) for _ in range(3))
-        share, bearing = float(random.random()), uniform(random, self.bearing)
+        share = float(random.random())
+        bearing = uniform(random, self.bearing)
         extent = math.hypot(a, b, c) / 2
         radius = max(uniform(random, self.radius), MIN_BASE_DISTANCE_M + extent)
         position = (
@@ -77,7 +76,8 @@ class FreeMix(SceneFamily):
             uniform(random, self.height),
         )
         roll, pitch, yaw = random.uniform(-math.pi, math.pi, 3).tolist()
-        name, turn = f"obstacle {index + 1}", (roll, pitch, yaw)
+        name = f"obstacle {index + 1}"
+        turn = (roll, pitch, yaw)
         if share < self.spheres:
             return Obstacle(name=name, kind="sphere", position=position, radius=a / 2)
         if share < self.spheres + self.cylinders:

@@ -37,7 +37,8 @@ class Furniture:
         """Return a point in the frame of the robot's base [m]."""
         x, y, z = local
         # Rotation about z by the yaw, then the shift to the origin.
-        cos, sin = math.cos(self.yaw), math.sin(self.yaw)
+        cos = math.cos(self.yaw)
+        sin = math.sin(self.yaw)
         return (
             self.origin[0] + cos * x - sin * y,
             self.origin[1] + sin * x + cos * y,
@@ -71,9 +72,12 @@ class Furniture:
 
     def grasp(self, position: Point, approach: Point, tilt: float = 0.3) -> None:
         """Add a grasp; the approach is normalized."""
-        cos, sin = math.cos(self.yaw), math.sin(self.yaw)
+        cos = math.cos(self.yaw)
+        sin = math.sin(self.yaw)
         length = math.hypot(*approach)
-        x, y, z = approach[0] / length, approach[1] / length, approach[2] / length
+        x = approach[0] / length
+        y = approach[1] / length
+        z = approach[2] / length
         direction = np.array([cos * x - sin * y, sin * x + cos * y, z])
         self.grasps.append(Grasp(np.array(self.point(position)), direction, tilt))
 
@@ -90,10 +94,8 @@ def place_furniture(
     random: np.random.Generator, family: SceneFamily, z: float = 0.0
 ) -> Furniture:
     """Draw the frame of furniture: its origin is the center of the front at the height z [m]."""
-    distance, bearing = (
-        uniform(random, family.distance),
-        uniform(random, family.bearing),
-    )
+    distance = uniform(random, family.distance)
+    bearing = uniform(random, family.bearing)
     yaw = bearing + uniform(random, family.turn)
     return Furniture(
         (distance * math.cos(bearing), distance * math.sin(bearing), z), yaw
@@ -148,7 +150,8 @@ def place_objects(
             continue
         x, y = place
         circles.append((x, y, radius))
-        name, center = f"{prefix} {index + 1}", (x, y, z + height / 2)
+        name = f"{prefix} {index + 1}"
+        center = (x, y, z + height / 2)
         if is_box:
             turn = float(random.uniform(-math.pi, math.pi))
             furniture.box(name, center, (a, b, height), turn)

@@ -151,11 +151,9 @@ def make_scenes(
 
 def _check_no_manifold(problem: Problem, robot: Robot) -> None:
     """Raise UsageError for constraints that hardly any drawn end meets."""
-    world, rest, zero = (
-        World(robot, problem.obstacle, problem.object_size),
-        np.zeros(robot.n),
-        np.zeros((1, 3)),
-    )
+    world = World(robot, problem.obstacle, problem.object_size)
+    rest = np.zeros(robot.n)
+    zero = np.zeros((1, 3))
     world.set_state(
         robot.home, rest, rest, scene_of(problem, zero, zero, zero).poses[0]
     )
@@ -185,8 +183,10 @@ class _Generator:
         self, random: np.random.Generator, name: str, count: int
     ) -> Iterator[SceneProblem]:
         """Yield up to ``count`` problems in one scene."""
-        layout, names = self.family.draw(random), self.robot.joint_names
-        start, goal = np.zeros(self.robot.n), np.zeros((0, self.robot.n))
+        layout = self.family.draw(random)
+        names = self.robot.joint_names
+        start = np.zeros(self.robot.n)
+        goal = np.zeros((0, self.robot.n))
         scene = SceneProblem(
             name=name,
             obstacles=layout.obstacles,
@@ -215,7 +215,8 @@ class _Generator:
         self, states: RestingStates, layout: Layout, random: np.random.Generator
     ) -> list[Array]:
         """Return collision-free states at grasps, a few for each grasp, shape (G, n) each."""
-        kinematics, found = PoseKinematics(self.robot), list[Array]()
+        kinematics = PoseKinematics(self.robot)
+        found = list[Array]()
         for index in random.permutation(len(layout.grasps))[:MAX_GRASPS]:
             grasp = layout.grasps[index]
             rotations = grasp_rotations(grasp, POSES_PER_GRASP, random)

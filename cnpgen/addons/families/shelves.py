@@ -34,11 +34,9 @@ class Bookshelf(SceneFamily):
     def draw(self, random: np.random.Generator) -> Layout:
         """Draw boards, sides and objects."""
         shelf = place_furniture(random, self, uniform(random, self.bottom))
-        width, depth, levels = (
-            uniform(random, self.width),
-            uniform(random, self.depth),
-            whole(random, self.levels),
-        )
+        width = uniform(random, self.width)
+        depth = uniform(random, self.depth)
+        levels = whole(random, self.levels)
         spacing = uniform(random, self.spacing)
         height = levels * spacing
         # One board more than levels: the top board closes the last one.
@@ -129,11 +127,11 @@ class Cubby(SceneFamily):
         width, height, depth = (
             uniform(random, size) for size in (self.width, self.height, self.depth)
         )
-        y, z = (
-            (uniform(random, self.shift) - 0.5) * width,
-            uniform(random, self.shift) * height,
-        )
-        thin, left, right = SHELF_BOARD_M, width / 2, -width / 2
+        y = (uniform(random, self.shift) - 0.5) * width
+        z = uniform(random, self.shift) * height
+        thin = SHELF_BOARD_M
+        left = width / 2
+        right = -width / 2
         cubby.box("bottom", (depth / 2, 0, 0), (depth, width, thin))
         cubby.box("top", (depth / 2, 0, height), (depth, width, thin))
         cubby.box("left", (depth / 2, left, height / 2), (depth, thin, height - thin))

@@ -42,11 +42,10 @@ class Tabletop(SceneFamily):
             # The second and the third table are at right angles to the first, on either
             # side.
             bearing = first + (0.0, side, -side)[index] * math.pi / 2
-            distance, height = (
-                uniform(random, self.distance),
-                uniform(random, self.height),
-            )
-            width, depth = uniform(random, self.width), uniform(random, self.depth)
+            distance = uniform(random, self.distance)
+            height = uniform(random, self.height)
+            width = uniform(random, self.width)
+            depth = uniform(random, self.depth)
             origin = distance * math.cos(bearing), distance * math.sin(bearing), height
             table = Furniture(origin, bearing)
             table.box(
@@ -66,10 +65,8 @@ class Tabletop(SceneFamily):
                 prefix=f"object {index + 1}",
             )
             for _ in range(2):  # free places
-                x, y = (
-                    random.uniform(area[0], area[1]),
-                    random.uniform(area[2], area[3]),
-                )
+                x = random.uniform(area[0], area[1])
+                y = random.uniform(area[2], area[3])
                 table.grasp((float(x), float(y), 0.05), (0, 0, -1))
             tables.append(table)
         return tables[0].layout(*tables[1:])
@@ -90,7 +87,8 @@ class TablePick(SceneFamily):
     def draw(self, random: np.random.Generator) -> Layout:
         """Draw the table and the objects."""
         table = place_furniture(random, self, uniform(random, self.height))
-        depth, width = 0.55, 0.9
+        depth = 0.55
+        width = 0.9
         table.box("table", (depth / 2, 0, -BOARD_M / 2), (depth, width, BOARD_M))
         objects = self.objects, self.object_width, self.object_height
         place_objects(
@@ -102,8 +100,10 @@ class TablePick(SceneFamily):
             # Positions are in the frame of the robot's base, and grasps in that of the
             # table.
             x, y, _ = obstacle.position or (0.0, 0.0, 0.0)
-            dx, dy = x - table.origin[0], y - table.origin[1]
-            cos, sin = math.cos(table.yaw), math.sin(table.yaw)
+            dx = x - table.origin[0]
+            dy = y - table.origin[1]
+            cos = math.cos(table.yaw)
+            sin = math.sin(table.yaw)
             table.grasp(
                 (cos * dx + sin * dy - 0.1, -sin * dx + cos * dy, 0.06),
                 (0.5, 0, -1),
@@ -127,9 +127,12 @@ class TableUnderPick(SceneFamily):
 
     def draw(self, random: np.random.Generator) -> Layout:
         """Draw the table, the plate on which it stands, and the objects."""
-        floor, top = uniform(random, self.floor), uniform(random, self.height)
+        floor = uniform(random, self.floor)
+        top = uniform(random, self.height)
         table = place_furniture(random, self)
-        depth, width, leg = 0.55, 0.9, 0.05
+        depth = 0.55
+        width = 0.9
+        leg = 0.05
         table.box("top", (depth / 2, 0, top), (depth, width, BOARD_M))
         table.box(
             "floor", (depth / 2 + 0.05, 0, floor - BOARD_M / 2), (depth, width, BOARD_M)

@@ -82,7 +82,8 @@ def control_points(
         UsageError: A shape is wrong.
     """
     dtype = jnp.promote_types(phi.dtype, np.float32)
-    phi, log_rate = _real("phi", phi, dtype), _real("log_rate", log_rate, dtype)
+    phi = _real("phi", phi, dtype)
+    log_rate = _real("log_rate", log_rate, dtype)
     layer.check_shapes(tasks, phi.shape, log_rate.shape)
     path, rate = _control_points(layer, jax.tree.map(jnp.asarray, tasks), phi, log_rate)
     return path, rate
@@ -175,7 +176,8 @@ def _evaluate(
     Return totals and terms, and the gradients if requested.
     """
     path, rate, weights, _ = arguments
-    n, m = len(path), len(weights)
+    n = len(path)
+    m = len(weights)
     shapes = [(n,), (n, 1 + m), *([path.shape, rate.shape, (n, m)] if gradient else [])]
 
     def call(*arguments: Any) -> tuple[Any, ...]:

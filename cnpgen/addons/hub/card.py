@@ -73,7 +73,8 @@ cnpgen.load_dataset("CNPGEN")
 ```
 """
 
-_BEFORE_NOTES, _AFTER_NOTES = ("split", "rows", "files"), "## How it was made"
+_BEFORE_NOTES = ("split", "rows", "files")
+_AFTER_NOTES = "## How it was made"
 
 _VERIFY = """\
 ```text

@@ -45,7 +45,8 @@ def describe_frame(spec: DatasetSpec) -> str:
 
 def limits_table(spec: DatasetSpec) -> str:
     """Return the limits of all joints in SI units; empty if the specification lists none."""
-    names, limits = spec.robot.get("joint_names", ()), spec.robot.get("limits", {})
+    names = spec.robot.get("joint_names", ())
+    limits = spec.robot.get("limits", {})
     if not limits:
         return ""
     position = next(field for field in spec.fields if field.names == tuple(names))

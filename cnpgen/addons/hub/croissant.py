@@ -81,7 +81,8 @@ def _records(
     pattern: str,
 ) -> dict[str, Any]:
     """Describe the files of all splits, with a record set for each split; "{}" in the pattern of paths is the split."""
-    distribution, records = [], []
+    distribution = []
+    records = []
     for split, files in splits.items():
         if not files:
             continue

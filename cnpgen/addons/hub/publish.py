@@ -80,7 +80,8 @@ def publish_dataset(
             f"must be the name of a repository, USER/NAME, got {to!r:.200}",
             argument="to",
         )
-    source, target = Path(folder), Path(out)
+    source = Path(folder)
+    target = Path(out)
     # A repository inside of the dataset would be a part of what it publishes.
     if target.resolve().is_relative_to(source.resolve()):
         raise UsageError(
@@ -185,7 +186,8 @@ def _write_table(source: Path, spec: DatasetSpec, task: ShardTask, path: Path) -
 def link_or_copy(source: Path, target: Path) -> None:
     """Link or copy a file, unless the copy has the same size and is not older."""
     if target.exists():
-        before, now = target.stat(), source.stat()
+        before = target.stat()
+        now = source.stat()
         if before.st_size == now.st_size and before.st_mtime >= now.st_mtime:
             return
         target.unlink()

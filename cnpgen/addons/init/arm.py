@@ -30,7 +30,8 @@ from cnpgen.robots.urdf_parameters import (
 )
 
 # Ranges to either side, where the URDF has none.
-DEFAULT_RANGE_RAD, DEFAULT_RANGE_M = math.pi, 0.5
+DEFAULT_RANGE_RAD = math.pi
+DEFAULT_RANGE_M = 0.5
 MAX_INERTIA_ERROR = 0.01  # relative; published URDFs round their numbers
 MAX_LIMITED_RAD = 1000.0  # largest limit of a revolute joint that is one
 _FINGER = re.compile(r"finger|knuckle|thumb|jaw|claw")  # in names of links
@@ -101,7 +102,8 @@ def read_arm(urdf: Path, tip: str | None) -> Arm:
         UsageError: The frame does not exist, or several links have no child.
     """
     tree, parameters = _tree_and_parameters(urdf)
-    inertias, joints = parameters.inertias, parameters.joints
+    inertias = parameters.inertias
+    joints = parameters.joints
     # Without a choice, only an unambiguous end of the robot is the tip.
     tip = tip if tip is not None else _default_tip(urdf, list(inertias), joints)
     if text := missing_frame(tree, urdf, tip):
@@ -116,7 +118,8 @@ def read_arm(urdf: Path, tip: str | None) -> Arm:
     moved = tuple(link for link in inertias if moving[0] in _path(link, joints))
     names = {joint.name for joint in moving}
     movable = [joint.name for joint in joints.values() if joint.kind != "fixed"]
-    shaped, drawn = _links_with(tree, "collision"), _links_with(tree, "visual")
+    shaped = _links_with(tree, "collision")
+    drawn = _links_with(tree, "visual")
     return Arm(
         urdf=urdf,
         tip=tip,
@@ -193,7 +196,8 @@ def _locked_positions(
             continue
         if joint.name in planned or joint.name in mimics:
             continue
-        low, high = joint.limits.get("lower", 0.0), joint.limits.get("upper", 0.0)
+        low = joint.limits.get("lower", 0.0)
+        high = joint.limits.get("upper", 0.0)
         # Zero, clipped to the limits; continuous joints have none.
         nearest = 0.0 if joint.kind == "continuous" else min(max(0.0, low), high)
         if nearest or joint.name in offset_of:
@@ -220,7 +224,8 @@ def arm_notes(arm: Arm) -> Iterator[str]:
             yield f"{text}: [limits] has a placeholder, {placeholder}; enter the value of the data sheet"
     yield from arm.joint_notes
     if arm.friction:
-        use, shares = arm.urdf_dynamics, ", ".join(map(str, arm.friction))
+        use = arm.urdf_dynamics
+        shares = ", ".join(map(str, arm.friction))
         reason = {"use": "", "ignore": ", since the values look like placeholders"}[use]
         yield f'friction in the URDF: {shares}; [drive] has urdf_dynamics = "{use}"{reason}'
     if light := [
@@ -278,10 +283,8 @@ def _without_fingers(link: str, joints: Mapping[str, UrdfJoint]) -> str:
 def _path(frame: str, joints: Mapping[str, UrdfJoint]) -> list[UrdfJoint]:
     """Return the joints between the root and a frame, from the root outwards."""
     child_of = {joint.name: child for child, joint in joints.items()}
-    found, link = (
-        list[UrdfJoint](),
-        frame if frame in joints else child_of.get(frame, frame),
-    )
+    found = list[UrdfJoint]()
+    link = frame if frame in joints else child_of.get(frame, frame)
     while link in joints:
         found.append(joints[link])
         link = joints[link].parent
@@ -312,7 +315,8 @@ def _joint(joint: UrdfJoint) -> ArmJoint:
         "torque": effort == 0,
     }
     # Soft limits narrow the range.
-    lower, upper = max(lower, joint.soft[0]), min(upper, joint.soft[1])
+    lower = max(lower, joint.soft[0])
+    upper = min(upper, joint.soft[1])
     half = DEFAULT_RANGE_M if joint.kind == "prismatic" else DEFAULT_RANGE_RAD
     return ArmJoint(
         name=joint.name,

@@ -27,7 +27,8 @@ def doubts(tree: Element) -> Iterator[str]:
     for link in tree.findall("link"):
         yield from _of_link(tree, link)
     for element in [*tree.findall("joint"), *tree.findall("link")]:
-        name, kind = element.get("name", ""), element.tag
+        name = element.get("name", "")
+        kind = element.tag
         for origin in element.iter("origin"):
             rpy = numbers_in(origin, "rpy", _ZERO)
             if (angle := max(rpy, key=abs)) and abs(angle) > MAX_ANGLE_RAD:
@@ -36,7 +37,9 @@ def doubts(tree: Element) -> Iterator[str]:
 
 
 def _of_joint(joint: Element) -> Iterator[str]:
-    name, kind, limit = joint.get("name", ""), joint.get("type"), joint.find("limit")
+    name = joint.get("name", "")
+    kind = joint.get("type")
+    limit = joint.find("limit")
     if kind in {"revolute", "continuous", "prismatic"} and joint.find("axis") is None:
         yield f"joint {name}: it has no <axis>, so that it moves along or about 1 0 0"
     if kind in {"revolute", "prismatic"} and limit is not None:
@@ -50,13 +53,12 @@ def _of_joint(joint: Element) -> Iterator[str]:
 
 
 def _of_link(tree: Element, link: Element) -> Iterator[str]:
-    name, inertial = link.get("name", ""), link.find("inertial")
+    name = link.get("name", "")
+    inertial = link.find("inertial")
     if inertial is None:
         return
-    mass, inertia = (
-        number_in(inertial.find("mass"), "value", 0.0),
-        inertial.find("inertia"),
-    )
+    mass = number_in(inertial.find("mass"), "value", 0.0)
+    inertia = inertial.find("inertia")
     if inertia is None:
         yield f"link {name}: its <inertial> has no <inertia>, so that its {mass:g} kg count as a point"
     elif mass > MIN_MASS_KG and not any(
@@ -72,7 +74,8 @@ def _of_link(tree: Element, link: Element) -> Iterator[str]:
 
 def _size(tree: Element, link: Element) -> float | None:
     """Return the distance from the origin of a link to its geometry and child joints [m]; None with meshes."""
-    name, sizes = link.get("name", ""), [0.0]
+    name = link.get("name", "")
+    sizes = [0.0]
     for joint in tree.findall("joint"):
         parent = joint.find("parent")
         if parent is not None and parent.get("link") == name:
@@ -85,10 +88,8 @@ def _size(tree: Element, link: Element) -> float | None:
         parts = [math.hypot(*box) / 2]
         for kind in ("cylinder", "sphere", "capsule"):
             part = geometry.find(kind)
-            length, radius = (
-                number_in(part, "length", 0.0),
-                number_in(part, "radius", 0.0),
-            )
+            length = number_in(part, "length", 0.0)
+            radius = number_in(part, "radius", 0.0)
             parts.append(length / 2 + radius)
         sizes.append(_length(element) + max(parts))
     return max(sizes)

@@ -50,12 +50,14 @@ def comfortable_base(
         Joint positions [rad], rounded, and notes about conditions that it does not
         meet.
     """
-    world, states = World(robot), _states(robot)
+    world = World(robot)
+    states = _states(robot)
     tips, values, load = _measure_states(world, states)
     if not any(isinstance(each, JointTorque) for each in problem.constraint):
         load[:] = 0.0
     order = np.argsort(-_scores(robot, states, values), kind="stable")
-    free, light = _free_states(robot, states), load <= MAX_LOAD
+    free = _free_states(robot, states)
+    light = load <= MAX_LOAD
     # Groups of states from the best to the least demanding one.
     groups = [
         _are_in_front(robot, tips) & light,
@@ -83,7 +85,8 @@ def comfortable_base(
 
 def _scores(robot: Robot, states: Array, values: Array) -> Array:
     """Return manipulability times the distance from the limits, by singular values of shape (N, k); shape (N,)."""
-    lower, upper = robot.position_lower, robot.position_upper
+    lower = robot.position_lower
+    upper = robot.position_upper
     # 1 in the middle of all joints, 0 at a limit of one of them.
     offsets = (states - (upper + lower) / 2) / ((upper - lower) / 2)
     # Directions in which the tip of an arm of fewer joints never moves do not count.
@@ -112,7 +115,10 @@ def _states(robot: Robot) -> Array:
 
 def _measure_states(world: World, states: Array) -> tuple[Array, Array, Array]:
     """Return tips [m], (N, 3), singular values of their Jacobians, (N, min(3, n)), shares of torque limits, (N,)."""
-    tips, values, load, still = [], [], [], np.zeros(world.robot.n)
+    tips = []
+    values = []
+    load = []
+    still = np.zeros(world.robot.n)
     for q in states:
         world.set_state(q, still, still, np.zeros(0))
         tips.append(world.tip_position)
@@ -123,7 +129,8 @@ def _measure_states(world: World, states: Array) -> tuple[Array, Array, Array]:
 
 def _free_states(robot: Robot, states: Array) -> NDArray[np.bool_]:
     """Return a mask of the states without collisions of links, shape (N,)."""
-    free, shape = np.ones(len(states), bool), robot.shape
+    free = np.ones(len(states), bool)
+    shape = robot.shape
     if shape is not None:
         poses = joint_poses(robot.model, states)
         contact = LinkContact(
@@ -160,9 +167,9 @@ def find_boxes(pipeline: Pipeline) -> tuple[Pipeline, float]:
     tips = _measure_states(world, _states(robot)[:500])[0]
     # At the base configuration.
     world = World(robot)
-    centre, reach = (
-        world.tip_position,
-        float(np.linalg.norm(tips - robot.chain.joints[0].translation, axis=1).max()),
+    centre = world.tip_position
+    reach = float(
+        np.linalg.norm(tips - robot.chain.joints[0].translation, axis=1).max()
     )
     moves = np.ptp(tips, axis=0) > MIN_TIP_TRAVEL_M
     found: list[tuple[float, Pipeline]] = []

@@ -135,7 +135,8 @@ def _reference_bodies(
     urdf: str, path: Path, packages: Sequence[Path], model: "pin.Model"
 ) -> list[tuple[str, CollisionBody]]:
     """Return (link, body) of all collision elements, in the frames of the joints that move the links."""
-    bodies, errors = [], list[str]()
+    bodies = []
+    errors = list[str]()
     for link in urdf_tree(urdf).iter("link"):
         name = link.get("name", "")
         for element in link.iter("collision"):
@@ -177,7 +178,8 @@ def _exact_body(part: ConvexPart) -> CollisionBody:
 
     if not part.radius:
         return body_of_part(part)[1]
-    first, last = part.vertices[0], part.vertices[-1]
+    first = part.vertices[0]
+    last = part.vertices[-1]
     length = float(np.linalg.norm(last - first))
     geometry = coal.Capsule(part.radius, length) if length else coal.Sphere(part.radius)
     placement = coal.Transform3s(

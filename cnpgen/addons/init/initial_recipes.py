@@ -43,7 +43,8 @@ from cnpgen.schema.keys import PerJoint, Range
 from cnpgen.store.files.accounted import check_allowed
 
 # Range of inverse kinematics guesses around the base configuration.
-GUESS_RANGE_RAD, GUESS_RANGE_M = 0.5, 0.1
+GUESS_RANGE_RAD = 0.5
+GUESS_RANGE_M = 0.1
 # Jerk limits per acceleration limit [1/s]; Franka Research 3: 500 ('cnpgen docs
 # references').
 INITIAL_JERK_RATE = 100.0
@@ -137,13 +138,16 @@ def dataset_of(initial: InitialProblem, folder: Path) -> tuple[DatasetRecipe, fl
 
     Raise RecipeError if none are found.
     """
-    problem, name = initial.problem, initial.problem.name
-    title, path = f"From rest to rest: {name}", folder / "pipeline.toml"
+    problem = initial.problem
+    name = initial.problem.name
+    title = f"From rest to rest: {name}"
+    path = folder / "pipeline.toml"
     stages = _stages(initial.arm, problem)
     pipeline, share = find_boxes(
         Pipeline(name=name, title=title, problem=problem, stage=stages, path=path)
     )
-    title, path = f"Motions from rest to rest: {name}", folder / "dataset.toml"
+    title = f"Motions from rest to rest: {name}"
+    path = folder / "dataset.toml"
     splits = {"train": 18_000, "validation": 2_000}
     return DatasetRecipe(
         name=name, title=title, pipeline=pipeline, splits=splits, path=path
@@ -177,7 +181,8 @@ def _problem(
     limits = LimitSpec(
         velocity_scale=0.8, torque_scale=TORQUE_SCALE, **_replaced_limits(arm)
     )
-    path, title = folder / "problem.toml", f"Move {arm.urdf.stem} within its limits"
+    path = folder / "problem.toml"
+    title = f"Move {arm.urdf.stem} within its limits"
     return Problem(
         name=name,
         title=title,
@@ -243,7 +248,9 @@ def _with_torque_limits(arm: Arm, robot: Robot) -> tuple[Arm, float, list[str]]:
         RecipeError: Gravity needs so much torque that masses are in another unit.
     """
     moving, at_rest = _torques(robot)
-    notes, planned, scale = list[str](), list[ArmJoint](), TORQUE_SCALE
+    notes = list[str]()
+    planned = list[ArmJoint]()
+    scale = TORQUE_SCALE
     for joint, load in zip(
         arm.planned,
         np.quantile(at_rest, MIN_HOLDING_FRACTION, axis=0).tolist(),
@@ -304,8 +311,10 @@ def _torques(robot: Robot) -> tuple[Array, Array]:
     """Return absolute torques [N m] at random states within the limits, in motion and at rest, both of shape (K, n)."""
     import pinocchio as pin
 
-    model, random = robot.model, np.random.default_rng(0)
-    data, still = model.createData(), np.zeros(robot.n)
+    model = robot.model
+    random = np.random.default_rng(0)
+    data = model.createData()
+    still = np.zeros(robot.n)
     q = random.uniform(
         robot.position_lower, robot.position_upper, (TORQUE_STATES, robot.n)
     )

@@ -91,7 +91,8 @@ def _limits(place: str, table: Any) -> dict[str, float]:
     for key in ("max_velocity", "max_acceleration", "max_jerk", "max_effort"):
         if found.get(key, 1.0) <= 0:
             raise UsageError(f"{place}: {key} must be positive, got {found[key]:g}")
-    low, high = found.get("min_position", 0.0), found.get("max_position", 1.0)
+    low = found.get("min_position", 0.0)
+    high = found.get("max_position", 1.0)
     if "min_position" in found and low >= high:
         raise UsageError(
             f"{place}: min_position must be below max_position, got {low:g} and {high:g}"

@@ -44,7 +44,8 @@ def resolve_overlaps(problem: Problem) -> LinkOverlaps:
     hulls = _gap(problem)
     problem, parts = _decompose(problem, hulls)
     problem, parts, contacts = _ignore_contacts(problem, parts)
-    shape, ignored = load_robot(problem).shape, problem.robot.ignored_pairs
+    shape = load_robot(problem).shape
+    ignored = problem.robot.ignored_pairs
     # Problems of ``init`` have the geometry of the URDF.
     assert shape is not None
     contacts += _pair_notes(shape.pairs, {*map(frozenset, ignored)})
@@ -58,7 +59,8 @@ def resolve_overlaps(problem: Problem) -> LinkOverlaps:
 
 def _gap(problem: Problem) -> HullGap:
     """Measure the gap of a problem's convex parts."""
-    robot, path = load_robot(problem), problem.urdf_path
+    robot = load_robot(problem)
+    path = problem.urdf_path
     assert robot.shape is not None
     return measure_hull_gap(
         _urdf(problem), path, problem.packages, model=robot.model, shape=robot.shape

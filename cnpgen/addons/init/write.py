@@ -42,7 +42,8 @@ _WHERE = "constraints and stages: 'cnpgen show --keys'."
 
 def problem_text(initial: InitialProblem, folder: Path) -> str:
     """Write the problem of an arm in a folder, with findings about the arm."""
-    problem, arm = initial.problem, initial.arm
+    problem = initial.problem
+    arm = initial.arm
     places: dict[str, Any] = {"robot.urdf": _from(folder, problem.robot.urdf)}
     places["robot.packages"] = tuple(
         _from(folder, each) for each in problem.robot.packages
@@ -250,7 +251,8 @@ class _Writer:
         below = list[str]()
         for key in keys(cls):
             name = f"{path}.{key.name}" if path else key.name
-            part, value = part_of(key), getattr(table, key.name, None)
+            part = part_of(key)
+            value = getattr(table, key.name, None)
             if part is None:
                 yield from self.key(key, table, name)
             elif is_array(key):

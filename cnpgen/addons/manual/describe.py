@@ -230,10 +230,8 @@ def link_rows(shape: Shape) -> list[tuple[str, ...]]:
     rows: list[tuple[str, ...]] = [head]
     for capsule in shape.capsules:
         parts = [part for part in shape.convex_parts if part.link == capsule.link]
-        corners, length = (
-            sum(len(part.vertices) for part in parts),
-            math.dist(capsule.first, capsule.second),
-        )
+        corners = sum(len(part.vertices) for part in parts)
+        length = math.dist(capsule.first, capsule.second)
         lengths = (
             f"{1e3 * value:.1f}" for value in (length, capsule.radius, capsule.overhang)
         )

@@ -139,7 +139,8 @@ def _table_to_dict(cls: type) -> dict[str, Any]:
 
 def _key_to_dict(key: Key) -> dict[str, Any]:
     """Describe a key, and the table or the tables that it holds."""
-    left_out, part = ("hint", "default", "since_version"), part_of(key)
+    left_out = ("hint", "default", "since_version")
+    part = part_of(key)
     # Types are no JSON; the default follows in the form of the file.
     content = {
         spec.name: getattr(key, spec.name)

@@ -21,7 +21,8 @@ class CallersClock:
 
     def __init__(self, max_step: float) -> None:
         self.offset: float | None = None
-        self._max_step, self._last_step = max_step, -np.inf
+        self._max_step = max_step
+        self._last_step = -np.inf
         self._lock = threading.Lock()
 
     def read(self, time: float, now: float, *, is_step: bool) -> tuple[float, bool]:

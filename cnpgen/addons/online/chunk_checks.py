@@ -77,7 +77,8 @@ class ChunkChecks:
         # Times of a chunk are nominal, without jitter.
         self._errors = SampleErrors(noise, 0.0, 0.0, 0.0, "")
         self._times = np.arange(length) / rate
-        self._n, self._columns = robot.n, 0
+        self._n = robot.n
+        self._columns = 0
 
     def read(self, chunk: ArrayLike) -> tuple[Array, Array]:
         """Return positions, shape (K, n), and the other columns, shape (K, D - n).
@@ -86,7 +87,8 @@ class ChunkChecks:
             UsageError: The shape is wrong, or differs from that of earlier chunks.
         """
         values = numbers("chunk", chunk)
-        length, n = len(self._times), self._n
+        length = len(self._times)
+        n = self._n
         if values.ndim != 2 or len(values) != length or values.shape[1] < n:
             raise UsageError(
                 f"must have shape ({length}, D) with at least {n} columns, the joints,"

@@ -36,7 +36,8 @@ from cnpgen.schema.arguments import integer, number
 from cnpgen.store.dataset_spec import StoredProblem
 
 RATES_HZ = 0.1, 1000.0  # range of an option
-MAX_CHUNK_SAMPLES, MAX_SPEED = 1000, 10.0
+MAX_CHUNK_SAMPLES = 1000
+MAX_SPEED = 10.0
 STOP_DELAY_S = 0.05  # of a stop after its cause: it is computed meanwhile
 MAX_POSITION = 1e6  # rad or m, of a chunk
 GRID_STEP_S = 4e-3  # of sampled motions, whose knots are 0.1 s apart
@@ -199,7 +200,8 @@ class ChunkExecutor:
         Raises:
             UsageError: The time is too early, or the executor was never reset.
         """
-        runtime, offset = self._checked_runtime(), self._clock.offset
+        runtime = self._checked_runtime()
+        offset = self._clock.offset
         at = number("time", time)
         # Without a set point, the clocks have no common time: the arm rests at reset.
         inner = runtime.now if offset is None else at - offset

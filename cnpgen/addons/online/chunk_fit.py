@@ -30,7 +30,8 @@ MIN_RUNNING_SPEED = 0.75  # of u: slower starts would end after 1.2 times the ch
 CHUNK_DEGREE = 7
 RATE_POINTS = 20
 FIXED_POINTS = 3  # of the path at either end, by position, velocity and acceleration
-MIN_PATH_POINTS, MAX_PATH_POINTS = 12, 20
+MIN_CHUNK_POINTS = 12
+MAX_CHUNK_POINTS = 20
 SAMPLES_PER_POINT = 2.5
 END_SAMPLES = 8  # whose parabola gives the state of a chunk at its ends
 BLEND_SAMPLES = 24  # in which the difference to the running motion vanishes
@@ -131,7 +132,7 @@ def chunk_fit(length: int, rate: float) -> ChunkFit:
     # D = (K - 1) h / (1 - b / 2), of the module.
     duration = (length - 1) * step / (1 - BRAKING_SHARE / 2)
     points = int(
-        np.clip(round(length / SAMPLES_PER_POINT), MIN_PATH_POINTS, MAX_PATH_POINTS)
+        np.clip(round(length / SAMPLES_PER_POINT), MIN_CHUNK_POINTS, MAX_CHUNK_POINTS)
     )
     spec = TrajectorySpec(
         degree=CHUNK_DEGREE, path_control_points=points, rate_control_points=RATE_POINTS

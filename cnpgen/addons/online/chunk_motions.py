@@ -55,11 +55,13 @@ class ChunkMotions:
     """Motions of the chunks of one problem, from the chunk's own timing up to a largest speed."""
 
     def __init__(self, record: ProblemRecord, rate: float, max_speed: float) -> None:
-        self._record, self._rate = record, rate
+        self._record = record
+        self._rate = rate
         self._speeds = np.linspace(1, max_speed, ceil((max_speed - 1) / SPEED_STEP) + 1)
         with loaded_problem(record) as loaded:
             self._violation = loaded.kernels.load(speed_violation)
-            self._orders, robot = loaded.problem.path_orders, loaded.robot
+            self._orders = loaded.problem.path_orders
+            robot = loaded.robot
         self._grids: dict[TrajectorySpec, PhaseGrid] = {}
         # Joints with less than two insets of range keep their middle.
         middle = (robot.position_lower + robot.position_upper) / 2
@@ -120,7 +122,8 @@ class ChunkMotions:
         """Return the phases at which splines of a kind are compared with the limits; it is kept."""
         if (grid := self._grids.get(spec)) is None:
             # Chebyshev phases are denser near both ends.
-            s, degree = chebyshev(SPEED_CHECK_INTERVALS), spec.degree
+            s = chebyshev(SPEED_CHECK_INTERVALS)
+            degree = spec.degree
             path, rate = (
                 np.stack([basis(s, points, degree, order) for order in range(orders)])
                 for points, orders in (

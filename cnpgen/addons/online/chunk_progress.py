@@ -62,7 +62,8 @@ class ChunkProgress:
 
     def executed(self, motion: ChunkMotion, plan: Plans, at: float) -> ExecutedChunk:
         """Return the chunk of a motion that joins at a time [s] with a plan of one of its speeds."""
-        fit, s = motion.fit, np.linspace(0, 1, len(motion.fit.times))
+        fit = motion.fit
+        s = np.linspace(0, 1, len(motion.fit.times))
         # Equal phases connect the time of the motion with the chunk time.
         times = plan.motion.time_at(s)[0]
         before = self.at(at)

@@ -100,7 +100,8 @@ def hit_tasks(
             name: values.T for name, values in zip(HIT_COLUMNS[:3], parts, strict=True)
         }
         check_units_of_states(completion.context.robot, states, noun="hit")
-    centre, goal = lanes("puck", puck, {2, 3}), lanes("target", target, {2})
+    centre = lanes("puck", puck, {2, 3})
+    goal = lanes("target", target, {2})
     direction = goal - centre[:2]
     # Equal positions have no direction.
     if not np.count_nonzero(direction, axis=0).all():

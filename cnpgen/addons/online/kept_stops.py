@@ -23,7 +23,8 @@ class KeptStops:
     """
 
     def __init__(self, checker: MotionChecker, *, measured: bool) -> None:
-        self._checker, self._measured = checker, measured
+        self._checker = checker
+        self._measured = measured
         self._lock = threading.Lock()
         self._motion: SampledMotion | None = None
         self._stops: list[tuple[float, SampledMotion]] = []
@@ -42,7 +43,8 @@ class KeptStops:
     def follow(self, motion: SampledMotion | None) -> None:
         """Compute the stops of another motion from its start on, and drop those of the last one; None ends it."""
         with self._lock:
-            self._motion, self._stops = motion, []
+            self._motion = motion
+            self._stops = []
         if motion is not None:
             threading.Thread(
                 target=self._keep, args=(motion,), name="cnpgen-stops", daemon=True

@@ -112,11 +112,10 @@ class PuckModel:
             if self.drag == 0
             else -np.expm1(-self.drag * time) / self.drag
         )
-        position, velocity = position.copy(), velocity.copy()
-        low, high = (
-            np.array([self.home_edge, -self.half_width]),
-            np.array([np.inf, self.half_width]),
-        )
+        position = position.copy()
+        velocity = velocity.copy()
+        low = np.array([self.home_edge, -self.half_width])
+        high = np.array([np.inf, self.half_width])
         for _ in range(MAX_BOUNCES):
             with np.errstate(divide="ignore", invalid="ignore"):
                 # The side band or the home band that each coordinate moves to, if there
@@ -214,12 +213,10 @@ class MovingHits:
         overlap: float,
     ) -> None:
         state, puck, velocity, target, share, meeting_time = arguments
-        self.model, self.distance, self.overlap, self.waits = (
-            model,
-            distance,
-            overlap,
-            meeting_time is not None,
-        )
+        self.model = model
+        self.distance = distance
+        self.overlap = overlap
+        self.waits = meeting_time is not None
         given = {"puck": puck, "puck_velocity": velocity, "target": target}
         parts = {name: lanes(name, values, {2}).T for name, values in given.items()}
         scalars = {
@@ -253,10 +250,8 @@ class MovingHits:
                 )
             parts[name] = np.repeat(values, size // len(values), axis=0)
         self.puck, self.velocity, self.target = (parts[name] for name in given)
-        self.share, self.meeting_time = (
-            parts["speed_share"][:, 0],
-            parts["meeting_time"][:, 0],
-        )
+        self.share = parts["speed_share"][:, 0]
+        self.meeting_time = parts["meeting_time"][:, 0]
         self.state = tuple(parts[f"state {index}"] for index in range(3))
         if self.waits and (self.state[1].any() or self.state[2].any()):
             raise UsageError(
@@ -285,11 +280,10 @@ def plan_moving_hits(
     the puck at this time. The iteration converges if the puck is slower than the
     mallet.
     """
-    time, speed = (
-        hits.meeting_time.copy(),
-        np.full(len(hits.puck), EXPECTED_HIT_SPEED_M_S),
-    )
-    reasons, active = np.full(len(hits.puck), "", object), np.arange(len(hits.puck))
+    time = hits.meeting_time.copy()
+    speed = np.full(len(hits.puck), EXPECTED_HIT_SPEED_M_S)
+    reasons = np.full(len(hits.puck), "", object)
+    active = np.arange(len(hits.puck))
     for iteration in range(MAX_MEETING_ITERATIONS):
         position, puck_velocity = hits.model.predict(
             hits.puck[active], hits.velocity[active], time[active]
@@ -322,20 +316,20 @@ def plan_moving_hits(
         # The mallet covers the overlap after the contact, at about its final speed.
         contact = plans.duration - hits.overlap / speed[active]
         # Fixed point: the contact time of the plan is the next meeting time.
-        change, last = np.abs(contact - time[active]), time[active]
+        change = np.abs(contact - time[active])
+        last = time[active]
         if hits.waits or not len(active) or (change <= MAX_MEETING_ERROR_S).all():
             break
         # Hits that have converged keep their time, so that their plans stay.
         time[active] = np.where(change <= MAX_MEETING_ERROR_S, last, contact)
     if not hits.waits:
-        delay, accepted, reason = (
-            np.zeros(len(active)),
-            change <= MAX_MEETING_ERROR_S,
-            NO_MEETING,
-        )
+        delay = np.zeros(len(active))
+        accepted = change <= MAX_MEETING_ERROR_S
+        reason = NO_MEETING
     else:
         # The arm waits until the plan meets the puck at the stated time.
-        delay, reason = hits.meeting_time[active] - contact, TOO_LATE
+        delay = hits.meeting_time[active] - contact
+        reason = TOO_LATE
         accepted = delay >= 0
     reasons[active[~accepted]] = reason
     touched = _touched_early(completion, hits, plans, delay)
@@ -358,11 +352,9 @@ def _touched_early(
     if not len(plans):
         return np.zeros(0, bool)
     # The row of a plan is that of its hit.
-    phases, rows, speed = (
-        np.linspace(0, 1, EARLY_CONTACT_PHASES),
-        plans.sample_id,
-        plans.columns["hit_speed"],
-    )
+    phases = np.linspace(0, 1, EARLY_CONTACT_PHASES)
+    rows = plans.sample_id
+    speed = plans.columns["hit_speed"]
     q = (
         _path_basis(plans.path_control_points.shape[1], plans.motion.degree)
         @ plans.path_control_points

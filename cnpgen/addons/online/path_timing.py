@@ -97,7 +97,8 @@ class PathLimits:
         node = np.clip(node, 0, len(self.times) - 2)
         width = self.times[node + 1] - self.times[node]
         share = np.clip((sigma - self.times[node]) / width, 0.0, 1.0)[..., None]
-        u2, w = (speed**2)[..., None], brake[..., None]
+        u2 = (speed**2)[..., None]
+        w = brake[..., None]
         # The value is linear in each of the tables, so the two nodes are compared.
         low, high = (
             np.abs(self.rest[k] + self.square[k] * u2 - self.brake_factor[k] * w)
@@ -134,8 +135,10 @@ def shape_at(x: Array, rise: float, fall: float) -> tuple[Array, Array, Array]:
     # A trapezoid of area 1: the speed falls by one.
     brake = height * np.minimum(np.minimum(x / rise, (1 - x) / fall), 1.0)
     # Integrals of the ramps (x - e)+ that w T consists of: its gradient changes at e.
-    edges, gradients = (0.0, rise, 1 - fall), (1 / rise, -1 / rise, -1 / fall)
-    lost, shortened = np.zeros_like(x), np.zeros_like(x)
+    edges = (0.0, rise, 1 - fall)
+    gradients = (1 / rise, -1 / rise, -1 / fall)
+    lost = np.zeros_like(x)
+    shortened = np.zeros_like(x)
     for edge, gradient in zip(edges, gradients, strict=True):
         after = np.maximum(x - edge, 0.0)
         lost += height * gradient * after**2 / 2
@@ -233,8 +236,10 @@ def _law_grid(motion: SampledMotion, law: TimeLaw) -> Array:
     No cell has a kink of w or of the motion's acceleration: a polynomial over it would
     exceed both of its ends.
     """
-    rise, fall = law.duration * law.rise, law.duration * law.fall
-    ramp, level = grid(rise), rise + grid(law.duration - rise - fall)
+    rise = law.duration * law.rise
+    fall = law.duration * law.fall
+    ramp = grid(rise)
+    level = rise + grid(law.duration - rise - fall)
     times = np.concatenate([ramp[:-1], level[:-1], law.duration - grid(fall)[::-1]])
     places = (_kinks(motion) - law.start) / law.duration
     # The times at which the law passes the kinks: the inverse of a table of the places.
@@ -272,7 +277,8 @@ def retimed(motion: SampledMotion, law: TimeLaw) -> SampledMotion:
         sigma = np.minimum(sigma, np.nextafter(motion.end_time, -np.inf))
     q, dq, ddq = motion.at(sigma)
     u[-1] = brake[-1] = 0.0  # exactly at rest
-    u, w = u[:, None], brake[:, None] / law.duration
+    u = u[:, None]
+    w = brake[:, None] / law.duration
     states = SetPoint(q, dq * u, ddq * u**2 - dq * w)
     # Slower times keep the place on the path of the plan.
     plan_times = np.interp(sigma, motion.edges, motion.plan_times)

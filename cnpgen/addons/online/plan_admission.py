@@ -61,8 +61,11 @@ class Admission:
         checker: MotionChecker,
         grid_step: float = MAX_GRID_STEP_S,
     ) -> None:
-        self._record, self._robot = record, open_problem(record)[1]
-        self._judge, self._checker, self._step = judge, checker, grid_step
+        self._record = record
+        self._robot = open_problem(record)[1]
+        self._judge = judge
+        self._checker = checker
+        self._step = grid_step
         self._parameters = _checked_parameters(record, self._robot, parameters)
         self._judges: dict[ProblemRecord, Judge] = {}
         # The memory of a judge is that of one thread.
@@ -120,7 +123,8 @@ class Admission:
         )
         # A sequence carries one load, which is that of the runtime.
         for part in parts:
-            own, expected = part.boundary.parameters, self._parameters
+            own = part.boundary.parameters
+            expected = self._parameters
             if (
                 own is not None
                 and expected is not None

@@ -180,10 +180,8 @@ def plan_hits(
             planner.model, planner.backend
         )
     contact = as_problem(planner.model.problem).first(PuckContact)
-    distance, overlap = (
-        _contact_distance(contact, chosen.contact_distance),
-        0.0 if contact is None else contact.overlap,
-    )
+    distance = _contact_distance(contact, chosen.contact_distance)
+    overlap = 0.0 if contact is None else contact.overlap
     if puck_velocity is None and meeting_time is None:
         plan = partial(
             _plan_resting,
@@ -259,7 +257,8 @@ def _first_valid(
     """Plan hits with ways back at the first speed of each at which both motions are valid."""
     first, *slower = RETURNING_SPEED_SHARES
     # All hits begin with the highest speed share.
-    hits, judge = plan(first), Judge(*open_problem(as_record(planner.model.problem)))
+    hits = plan(first)
+    judge = Judge(*open_problem(as_record(planner.model.problem)))
     shares = np.full(len(hits.reasons), first)
     for share in slower:
         invalid = ~(_valid(judge, hits.plans) & _valid(judge, hits.return_plans))
@@ -284,7 +283,8 @@ def _valid(judge: Judge, plans: Plans | None) -> NDArray[np.bool_]:
 
 def _plan_returns(planner: Planner, hits: PlannedHits, home: Array) -> Plans:
     """Plan the ways back, from the ends of hits to rest at home, shape (n,) or (N, n)."""
-    plans, n = hits.plans, planner.robot.n
+    plans = hits.plans
+    n = planner.robot.n
     if home.shape not in ((n,), (len(hits.reasons), n)):
         expected = f"({n},) or ({len(hits.reasons)}, {n})"
         raise UsageError(

@@ -109,7 +109,8 @@ class PlanRuntime:
             )
         self._robot = robot = open_problem(record)[1]
         check_range("grid_step", number("grid_step", grid_step), *GRID_STEPS_S, "s")
-        self._judge, self._checker = judge, MotionChecker()
+        self._judge = judge
+        self._checker = MotionChecker()
         self._admission = Admission(
             record,
             parameters,
@@ -131,7 +132,8 @@ class PlanRuntime:
         self._requests = ReplanRequests()
         # Until the runtime is resumed.
         self._stop: Stop | None = None
-        self._stops, self._closed = 0, False
+        self._stops = 0
+        self._closed = False
 
     def __enter__(self) -> PlanRuntime:
         return self
@@ -257,7 +259,8 @@ class PlanRuntime:
         Raises:
             UsageError: The runtime is closed.
         """
-        at, stops = number("at", at), self._stops
+        at = number("at", at)
+        stops = self._stops
         return self._requests.submit(lambda: self._replan(make_plan, at, stops), at)
 
     @checked_arguments

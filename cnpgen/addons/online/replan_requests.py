@@ -55,14 +55,16 @@ class ReplanRequests:
     def refuse_waiting(self, outcome: SwitchOutcome) -> None:
         """Resolve all requests that have not begun."""
         with self._changed:
-            waiting, self._waiting = self._waiting, deque()
+            waiting = self._waiting
+            self._waiting = deque()
         for request in waiting:
             _resolve(request, Switch(outcome, request.at))
 
     def close(self, timeout: float) -> bool:
         """Refuse all requests and wait at most a time [s] for the one that is served; return whether it has ended."""
         with self._changed:
-            self._closed, thread = True, self._thread
+            self._closed = True
+            thread = self._thread
             self._changed.notify()
         self.refuse_waiting(SwitchOutcome.CLOSED)
         if thread is None or thread is threading.current_thread():

@@ -109,7 +109,9 @@ def sample_motion(
     plan: Plans | JoinedPlans, start: float, *, step: float = MAX_GRID_STEP_S
 ) -> SampledMotion:
     """Sample one plan, or one sequence of plans, that starts at a time [s], at most a step [s] apart."""
-    edges, coefficients, last = [], [], np.zeros(0)
+    edges = []
+    coefficients = []
+    last = np.zeros(0)
     for part, begin, end in parts_of(plan):
         if end <= begin:
             # The next part replaces it at once.

@@ -67,7 +67,9 @@ def _earliest_law(limits: PathLimits, time: float, horizon: float) -> TimeLaw | 
     delay = np.repeat(DELAYS_S, count)
     high = horizon - delay
     possible = high > MIN_BRAKING_TIME_S
-    shape, delay, high = shape[possible], delay[possible], high[possible]
+    shape = shape[possible]
+    delay = delay[possible]
+    high = high[possible]
     # The longest duration counts as found, if it is feasible.
     feasible = limits.feasible(time + delay, high, shape)
     low = np.full_like(high, MIN_BRAKING_TIME_S)
@@ -76,7 +78,8 @@ def _earliest_law(limits: PathLimits, time: float, horizon: float) -> TimeLaw | 
         shorter = limits.feasible(time + delay, midpoint, shape)
         feasible |= shorter
         # High ends stay feasible, low ends are not.
-        low, high = np.where(shorter, low, midpoint), np.where(shorter, midpoint, high)
+        low = np.where(shorter, low, midpoint)
+        high = np.where(shorter, midpoint, high)
     if not feasible.any():
         return None
     # The law that ends first wins, whatever its delay.

@@ -31,7 +31,8 @@ class Timeline:
         self, first: SampledMotion, *, history: float, max_step: Array
     ) -> None:
         self._parts: tuple[SampledMotion, ...] = (first,)
-        self._history, self._max_step = history, max_step
+        self._history = history
+        self._max_step = max_step
         self._last_q: Array | None = None  # last set point
         self.now = first.start
 
@@ -71,7 +72,8 @@ class Timeline:
                 argument="time",
             )
         # Nothing changes before all checks have passed.
-        self.now, self._last_q = max(self.now, float(flat[-1])), states.q[-1]
+        self.now = max(self.now, float(flat[-1]))
+        self._last_q = states.q[-1]
         return _shaped(states, times)
 
     def state_at(self, times: Array) -> SetPoint:

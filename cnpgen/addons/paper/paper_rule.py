@@ -86,36 +86,37 @@ def _checks(
 
 
 def _is_nominal(constraint: Constraint, problem: Problem, world: PathWorld) -> bool:
-    robot, limits = world.robot, problem.limits
+    robot = world.robot
+    limits = problem.limits
     if isinstance(constraint, JointTorque):
         # The problem's scales are removed: the paper's rules refer to nominal limits.
-        values, limit = world.torque, robot.torque_limit / limits.torque_scale
+        values = world.torque
+        limit = robot.torque_limit / limits.torque_scale
     elif isinstance(constraint, JointVelocity):
         factor = world.parameters.values.get("velocity_factor", 1.0)
-        values, limit = world.dq, factor * robot.velocity_limit / limits.velocity_scale
+        values = world.dq
+        limit = factor * robot.velocity_limit / limits.velocity_scale
     else:
         factor = world.parameters.values.get("acceleration_factor", 1.0)
-        values, limit = (
-            world.ddq,
-            factor * robot.acceleration_limit / limits.velocity_scale,
-        )
+        values = world.ddq
+        limit = factor * robot.acceleration_limit / limits.velocity_scale
     return bool(np.all(np.abs(values) <= limit[:, None]))
 
 
 def _is_on_table(table: Table, world: PathWorld) -> bool:
-    tip, corners = (
-        world.parameters.on_table(world.tip_position),
-        table.bounds_of(world.parameters.values),
-    )
+    tip = world.parameters.on_table(world.tip_position)
+    corners = table.bounds_of(world.parameters.values)
     low, high = (np.array([*corner, table.z], float) for corner in corners)
-    low, high = low - TABLE_TOLERANCE_M, high + TABLE_TOLERANCE_M
+    low = low - TABLE_TOLERANCE_M
+    high = high + TABLE_TOLERANCE_M
     # Comparisons with nan are false, so nan violates the rule.
     return bool(np.all((low[:, None] < tip) & (tip < high[:, None])))
 
 
 def _is_clear(problem: Problem, world: PathWorld, obstacle_poses: Array) -> bool:
     size = np.array(problem.object_size or (0.0, 0.0, 0.0))
-    center, reach = world.tip_position, np.linalg.norm(size) / 2
+    center = world.tip_position
+    reach = np.linalg.norm(size) / 2
     measured = (
         world.object_distances()
         if any(not obstacle.upright for obstacle in problem.obstacle)
@@ -129,7 +130,8 @@ def _is_clear(problem: Problem, world: PathWorld, obstacle_poses: Array) -> bool
             if not np.all(measured[index] > -MAX_OBJECT_DEPTH_M):
                 return False
             continue
-        low, high = solid.low[:, None].copy(), solid.high[:, None]
+        low = solid.low[:, None].copy()
+        high = solid.high[:, None]
         # A box without a lower end reaches down without limit.
         if obstacle.height is None:
             low[2] = -np.inf

@@ -35,16 +35,15 @@ from cnpgen.store.files.checksum_file import (
 )
 from cnpgen.training.adam import learning_rate, start_adam
 
-PROPOSALS_KIND, PROPOSALS_VERSION = "cnpgen-proposals", 1
+PROPOSALS_KIND = "cnpgen-proposals"
+PROPOSALS_VERSION = 1
 MIN_PROPOSAL_DEVIATION = 0.02  # fraction of the reach
 STATES_PER_PLAN = 40
-HIDDEN_WIDTH, HIDDEN_LAYERS, BATCH_ROWS, TRAINING_STEPS, PEAK_LEARNING_RATE = (
-    128,
-    3,
-    256,
-    12_000,
-    2e-3,
-)
+HIDDEN_WIDTH = 128
+HIDDEN_LAYERS = 3
+BATCH_ROWS = 256
+TRAINING_STEPS = 12_000
+PEAK_LEARNING_RATE = 2e-3
 
 
 @dataclass(frozen=True, eq=False)
@@ -170,7 +169,8 @@ def train_proposals(
     random = np.random.default_rng(seed)
     inputs, changes = _training_rows(plans, ahead, random)
     robot = open_problem(plans.problem)[1]
-    reach, deviation = robot.velocity_limit * ahead, inputs.std(axis=0)
+    reach = robot.velocity_limit * ahead
+    deviation = inputs.std(axis=0)
     scale = np.where(deviation > 1e-9, 1 / np.maximum(deviation, 1e-9), 0.0)
     architecture = Architecture(
         inputs=inputs.shape[1],
@@ -188,10 +188,8 @@ def train_proposals(
     network = Proposals(
         architecture, parameters, inputs.mean(axis=0), scale, reach, ahead, made
     )
-    features, targets = (
-        standardize(inputs, network.mean, scale),
-        (changes / reach).astype(np.float32),
-    )
+    features = standardize(inputs, network.mean, scale)
+    targets = (changes / reach).astype(np.float32)
     return replace(network, parameters=_fit(network, features, targets, steps, random))
 
 
@@ -225,10 +223,8 @@ def _fit(
     random: np.random.Generator,
 ) -> AnyArray:
     """Run all training steps; return the average of the last parameters."""
-    adam, gradient = (
-        start_adam(network.parameters.copy()),
-        np.empty_like(network.parameters),
-    )
+    adam = start_adam(network.parameters.copy())
+    gradient = np.empty_like(network.parameters)
     split = network.architecture.split
     for step in range(steps):
         batch = random.integers(0, len(features), BATCH_ROWS)

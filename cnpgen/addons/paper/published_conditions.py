@@ -112,10 +112,8 @@ def _gaps(point: Vec, box: Any) -> list[Any]:
 
 
 def _corners(state: SymbolicState) -> list[Vec]:
-    kin, half = (
-        state.kinematics,
-        [edge / 2 for edge in state.object_size or (0.0, 0.0, 0.0)],
-    )
+    kin = state.kinematics
+    half = [edge / 2 for edge in state.object_size or (0.0, 0.0, 0.0)]
     signs = product((-1.0, 1.0), repeat=3)
     offsets = [
         [sign * edge for sign, edge in zip(corner, half, strict=True)]

@@ -28,12 +28,16 @@ if TYPE_CHECKING:
     from cnpgen.robots.robot import Robot
     from cnpgen.world.world import World
 
-EULER, ROTATION_VECTOR = "xyz-euler", "rotation-vector"
+EULER = "xyz-euler"
+ROTATION_VECTOR = "rotation-vector"
 REGIONS = ("box", "sphere", "cylinder")
-MIN_LIMIT_RAD, MIN_REGION_M = 1e-4, 1e-4
+MIN_LIMIT_RAD = 1e-4
+MIN_REGION_M = 1e-4
 TOLERANCE = 1e-6  # rad or m that a valid motion may be outside, for rounding
 # Of the half widths, and at most, by which solvers stay inside.
-MARGIN_FRACTION, MAX_MARGIN_RAD, MAX_MARGIN_M = 0.05, 0.01, 2e-3
+MARGIN_FRACTION = 0.05
+MAX_MARGIN_RAD = 0.01
+MAX_MARGIN_M = 2e-3
 SMOOTHING = 1e-12  # of squares below a root, which has a derivative at 0 then
 
 
@@ -169,7 +173,8 @@ class LinkOrientation(_LinkPoseConstraint):
         pairs = {0: (-D[1][2], D[2][2]), 2: (-D[0][1], D[0][0])}
         rows = list[Any]()
         for axis in self.bounded:
-            sine, cosine = np.sin(self.limits[axis]), np.cos(self.limits[axis])
+            sine = np.sin(self.limits[axis])
+            cosine = np.cos(self.limits[axis])
             if axis == 1:
                 # D_02 = sin b
                 rows += [sine - D[0][2], sine + D[0][2]]
@@ -258,7 +263,8 @@ class LinkPosition(_LinkPoseConstraint):
         """Evaluate the depth of the point in the regions by Pinocchio's pose of the link [m]."""
         _, point = _measured_pose(world, self.link, np.array(self.offset))
         depth = reduce(np.maximum, [_depth(each, point) for each in self.region])
-        bounds, name = (np.zeros(1), np.full(1, np.inf)), f"region of {self.link}"
+        bounds = (np.zeros(1), np.full(1, np.inf))
+        name = f"region of {self.link}"
         return (Condition(name, "m", [depth], *bounds, "position"),)
 
 
@@ -267,7 +273,8 @@ def _half_widths(region: Obstacle) -> list[float]:
     if region.kind == "box":
         # Both faces of an axis have the same half width.
         return [size / 2 for size in region.size or () for _ in range(2)]
-    radius, half = region.radius or 0.0, (region.length or 0.0) / 2
+    radius = region.radius or 0.0
+    half = (region.length or 0.0) / 2
     return [radius] if region.kind == "sphere" else [radius, half, half]
 
 
@@ -366,10 +373,13 @@ def _symbolic_pose(
     """Return the rotation of a link and a point of it as SX."""
     from cnpgen.kernels.symbolic.linalg import add, constants, product, rows_of, times
 
-    frame, kinematics = _frame(state.robot, link), state.kinematics
-    R, joint = frame.placement.rotation, frame.parentJoint - 1
+    frame = _frame(state.robot, link)
+    kinematics = state.kinematics
+    R = frame.placement.rotation
+    joint = frame.parentJoint - 1
     # Pinocchio counts the universe as joint 0, the kinematics do not.
-    axes, point = kinematics.frames[joint], frame.placement.translation + R @ offset
+    axes = kinematics.frames[joint]
+    point = frame.placement.translation + R @ offset
     position = add(kinematics.origins[joint], times(axes, constants(point)))
     return product(axes, rows_of(R)), position
 

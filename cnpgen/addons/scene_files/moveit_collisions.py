@@ -10,8 +10,10 @@ from cnpgen.problems.scenes.scene_problem import SceneError
 from cnpgen.problems.scenes.yaml_document import part, scalar
 from cnpgen.store.files.accounted import AccountedMapping
 
-MAX_SCALE, MAX_PADDING_M = 10.0, 1.0
-ACM, OCTOMAP = "allowed_collision_matrix", "<octomap>"
+MAX_SCALE = 10.0
+MAX_PADDING_M = 1.0
+ACM = "allowed_collision_matrix"
+OCTOMAP = "<octomap>"
 
 
 def is_true(value: Any, where: str) -> bool:
@@ -51,7 +53,8 @@ def read_allowed_collisions(
     """
     matrix = part(scene, ACM, dict, place)
     always, never = _defaults(matrix, place)
-    pairs, world = {*_allowed_pairs(matrix, place)}, [*objects, OCTOMAP]
+    pairs = {*_allowed_pairs(matrix, place)}
+    world = [*objects, OCTOMAP]
     names = {str(name) for name in part(matrix, "entry_names", list, place)}
     refused = [f"{name} and all others" for name in always if name in attached]
     # A default of true must not contradict entries of false or other defaults.
@@ -108,7 +111,8 @@ def _allowed_pairs(matrix: Any, place: str) -> Iterator[frozenset[str]]:
         if len(enabled) != len(names):
             raise SceneError(f"{place}: {ACM} needs one value for each pair")
         for second, value in zip(names, enabled, strict=True):
-            flag, pair = is_true(value, f"{place}: {ACM}"), frozenset({first, second})
+            flag = is_true(value, f"{place}: {ACM}")
+            pair = frozenset({first, second})
             # Both entries of a pair, and those of repeated names.
             if allowed.setdefault(pair, flag) != flag and first != second:
                 text = f"{ACM} allows and forbids {first} and {second}"
@@ -120,7 +124,8 @@ def read_link_sizes(
     scene: AccountedMapping, place: str
 ) -> tuple[tuple[str, float, float], ...]:
     """Return links with their scale and padding [m], other than 1 and 0."""
-    sizes, neutral = dict[str, list[float]](), (1.0, 0.0)
+    sizes = dict[str, list[float]]()
+    neutral = (1.0, 0.0)
     for column, (key, name, most) in enumerate(
         (("link_scale", "scale", MAX_SCALE), ("link_padding", "padding", MAX_PADDING_M))
     ):

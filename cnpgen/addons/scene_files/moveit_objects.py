@@ -215,7 +215,8 @@ def read_attached(
         if operation_of(body, place) != "ADD":
             raise SceneError(f"{place}: operation must be ADD, which attaches it")
         # An attached object leaves the world, as it moves with the link from here on.
-        item, known = read_object(body, place), objects.pop(name, None)
+        item = read_object(body, place)
+        known = objects.pop(name, None)
         if not item.shapes and known is None:
             raise SceneError(
                 f"{place} has no shapes, and the world has no object of this name"

@@ -125,7 +125,8 @@ def _read_pair(
         )
         content = with_mesh_files(documents[file], file, options.packages)
         parts.append(accounted(content, account))
-    scene, own = parts[0], parts[-1]
+    scene = parts[0]
+    own = parts[-1]
     try:
         problem = _problem(scene_path, scene, path, own, options.present)
     except SceneError as error:
@@ -159,7 +160,8 @@ def _problem(
     present: Mapping[str, float],
 ) -> SceneProblem:
     name = re.sub(r"^(scene|request)[_-]?", "", path.stem) or path.stem
-    place, where = f"{scene_path}: scene {name!r}", str(path)
+    place = f"{scene_path}: scene {name!r}"
+    where = str(path)
     if is_true(scene.get("is_diff"), f"{place}: is_diff"):
         scene.refuse(
             "is_diff", "the file must have the whole scene, not changes of one"
@@ -306,7 +308,8 @@ def _alternatives(
     goals = part(request, "goal_constraints", list, where)
     if not all(isinstance(entry, dict) for entry in goals):
         raise SceneError(f"{where}: goal_constraints must be mappings")
-    with_joints, others = list[AccountedMapping](), list[AccountedMapping]()
+    with_joints = list[AccountedMapping]()
+    others = list[AccountedMapping]()
     for entry in goals:
         entry.refuse("visibility_constraints", "visibility is not supported")
         if not part(entry, "joint_constraints", list, where):

@@ -115,10 +115,8 @@ def _primitive(primitive: Any, pose: Pose, where: str) -> ObjectShape:
 def _with_poses(entry: Any, what: str, where: str) -> list[tuple[Any, Any]]:
     """Return the primitives or meshes of an object with their poses."""
     plural = "meshes" if what == "mesh" else f"{what}s"
-    shapes, poses = (
-        part(entry, plural, list, where),
-        part(entry, f"{what}_poses", list, where),
-    )
+    shapes = part(entry, plural, list, where)
+    poses = part(entry, f"{what}_poses", list, where)
     if len(shapes) != len(poses):
         raise SceneError(
             f"{where} has {len(shapes)} {plural} and {len(poses)} poses, expected equal numbers"

@@ -77,7 +77,8 @@ def _request(scene: SceneProblem, joints: Sequence[str]) -> str:
         raise SceneError(
             f"{scene.place} has no goal state, and goal poses are not written"
         )
-    names, lines = [_text(name) for name in joints], ["start_state:", "  joint_state:"]
+    names = [_text(name) for name in joints]
+    lines = ["start_state:", "  joint_state:"]
     lines += [
         f"    name: [{', '.join(names)}]",
         f"    position: {scene.start_q.tolist()}",

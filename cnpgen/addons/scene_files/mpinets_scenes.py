@@ -266,7 +266,8 @@ def _padded(kind: str, obstacles: list[list[Obstacle]]) -> dict[str, Array]:
     # Files of others have no spheres, so an empty dataset is left out.
     if kind == "sphere" and not most:
         return {}
-    count, width = len(obstacles), sum(widths)
+    count = len(obstacles)
+    width = sum(widths)
     values = np.zeros((count, most, width + 7))
     for row, items in enumerate(obstacles):
         for index, item in enumerate(items):

@@ -36,7 +36,8 @@ VOXEL_ROUNDING = (
     1e-9  # by which voxels are smaller than cells, so that each has one center
 )
 DEPTH = 16  # levels of an octree below its root
-MIN_RESOLUTION_M, MAX_RESOLUTION_M = 1e-3, 1.0
+MIN_RESOLUTION_M = 1e-3
+MAX_RESOLUTION_M = 1.0
 FREE, OCCUPIED, INNER = 1, 2, 3  # two bits of a child in a binary tree
 Cell = tuple[int, int, int, int]  # lower corner in finest cells, and edge length
 
@@ -125,7 +126,8 @@ def _read_binary(data: bytes, at: int, cell: Cell, cells: list[Cell]) -> int:
     # Two bytes in little-endian order: bits 2 i and 2 i + 1 are those of child i.
     bits = data[at] | data[at + 1] << 8
     kinds = [bits >> 2 * child & 3 for child in range(8)]
-    children, at = _children(cell), at + 2
+    children = _children(cell)
+    at = at + 2
     cells += [
         each for each, kind in zip(children, kinds, strict=True) if kind == OCCUPIED
     ]
@@ -141,7 +143,8 @@ def _read_full(data: bytes, at: int, cell: Cell, cells: list[Cell]) -> int:
     if at + 5 > len(data):
         raise ValueError(f"it is cut off at byte {at}")
     log_odds = np.frombuffer(data, "<f4", 1, at)[0]
-    mask, at = data[at + 4], at + 5
+    mask = data[at + 4]
+    at = at + 5
     if not np.isfinite(log_odds):
         raise ValueError("a node has a log-odds that is not finite")
     if not mask and log_odds >= 0:

@@ -110,10 +110,12 @@ def _boxes(points: Array, edge: float) -> list[tuple[Array, Array]]:
         # Voxels of an earlier block are no longer occupied.
         if occupied[tuple(voxel)]:
             block = _grown(occupied, voxel)
-            owner[block], occupied[block] = count, False
+            owner[block] = count
+            occupied[block] = False
             count += 1
     index = owner[tuple(voxels.T)]
-    low, high = np.full((count, 3), np.inf), np.full((count, 3), -np.inf)
+    low = np.full((count, 3), np.inf)
+    high = np.full((count, 3), -np.inf)
     # Boxes shrink from the voxels to the points in them.
     np.minimum.at(low, index, points)
     np.maximum.at(high, index, points)

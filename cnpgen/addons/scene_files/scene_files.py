@@ -82,7 +82,8 @@ def load_scenes(
         DatasetError: An HDF5 file is damaged.
         MissingExtraError: PyYAML is missing.
     """
-    path, start = Path(path), integer("start", start, least=0)
+    path = Path(path)
+    start = integer("start", start, least=0)
     stop = None if n is None else start + integer("n", n, least=1)
     is_list = not isinstance(packages, str | Path)
     if not is_list or not all(isinstance(each, str | Path) for each in packages):
@@ -96,7 +97,8 @@ def load_scenes(
     options = ReadingOptions(
         (*allow_unused, *allowed_elsewhere), tuple(map(Path, packages)), present or {}
     )
-    files, allowed = _files(path), options.allow_unused
+    files = _files(path)
+    allowed = options.allow_unused
     if len(files) == 1 and _is_hdf5(files[0]):
         warn_of_unneeded_packages({}, options.packages)
         found = list(read_mpinets(files[0], slice(start, stop), allow_unused=allowed))
@@ -122,7 +124,8 @@ def _warn_of_unneeded_start(
     scenes: Sequence[SceneProblem], present: Mapping[str, float]
 ) -> None:
     """Warn of a present state at which no scene starts."""
-    names, positions = tuple(present), [*present.values()]
+    names = tuple(present)
+    positions = [*present.values()]
     if present and not any(
         scene.joint_names == names and scene.start_q.tolist() == positions
         for scene in scenes
@@ -196,7 +199,8 @@ def _scenes(
 
     Requests of MoveIt belong to scenes in other files.
     """
-    moveit, allowed = dict[Path, Any](), options.allow_unused
+    moveit = dict[Path, Any]()
+    allowed = options.allow_unused
     for file in files:
         if _is_hdf5(file):
             yield from read_mpinets(file, slice(0, None), allow_unused=allowed)

@@ -59,7 +59,8 @@ def read_hdf5_tables(path: Path, _: LoadOptions) -> Iterator[TrajectoryTable]:
             )
         names = stated[0] if stated else ()
         arrays = {name: column.read() for name, column in columns.items()}
-        units, unused = dict[str, str](), [*(set(file.names()) - set(file))]
+        units = dict[str, str]()
+        unused = [*(set(file.names()) - set(file))]
         unused += [f"attribute {name}" for name in file.attributes]
         for name, column in columns.items():
             for attribute in column.attributes:

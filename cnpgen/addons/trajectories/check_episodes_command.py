@@ -183,7 +183,8 @@ def _calibrated(path: Path, arm: "RecordedArm") -> list[float]:
         raise UsageError(
             f"--calibration: the encoder of {arm.name} is not in the registry"
         )
-    step, factors = 2 * math.pi / arm.steps_per_turn, []
+    step = 2 * math.pi / arm.steps_per_turn
+    factors = []
     try:
         document = parse_json(read_file(path, max_bytes=1 << 20).decode())
         for joint in arm.joints:
@@ -236,7 +237,8 @@ def _lines(
     lines += [f"  not checked: {name}: {text}" for name, text in reasons.items()]
     excluded = [report.name for report in reports if report.level == Level.EXCLUDE]
     if excluded and recording.kind == "lerobot":
-        kept, gone = ", ".join(_kept(reports)), ", ".join(excluded)
+        kept = ", ".join(_kept(reports))
+        gone = ", ".join(excluded)
         lines += [
             f"  train without them: --dataset.episodes='[{kept}]'",
             f"  delete them: lerobot-edit-dataset --repo_id {path} --operation.type delete_episodes"

@@ -52,7 +52,9 @@ def _explanations(
     """Yield explanations, the velocities that each corrects, and the spans that these cover."""
     # Shifted velocities lack one span at an end of the motion; other explanations cover
     # all.
-    name, own, every = joint_names[joint], dq[:, joint], slice(None)
+    name = joint_names[joint]
+    own = dq[:, joint]
+    every = slice(None)
     between = _mean_of_neighbors(own)
     # Least squares: recorded velocity = factor * true velocity.
     factor = float(between @ mean[:, joint]) / float(mean[:, joint] @ mean[:, joint])

@@ -241,14 +241,16 @@ def _limit_findings(
         proven = known and limit.basis == VENDOR and quantity != "acceleration"
         if worst is None and quantity == "velocity":
             # Over many frames, a recorder that falls behind explains the excess, too.
-            far, proven = replace(samples, lags=None), False
+            far = replace(samples, lags=None)
+            proven = False
             worst = _worst(limit, far.compared(quantity, limit, jitter))
         if worst is None:
             continue
         # A velocity that a stall of the recorder explains is for review.
         if proven and quantity == "velocity" and largest > jitter:
             of_stall = _worst(limit, samples.compared(quantity, limit, largest))
-            proven, worst = of_stall is not None, of_stall or worst
+            proven = of_stall is not None
+            worst = of_stall or worst
         joint, time, value, bound = worst
         word = "at least" if value >= bound else "at most"
         yield EpisodeFinding(
@@ -275,7 +277,9 @@ class _Samples:
         self, quantity: str, limit: ArmLimit, jitter: float
     ) -> Iterator[tuple[MeanDerivatives, Array, Array]]:
         """Yield bounds of a quantity of every curve, with the lower and upper limits that hold for each."""
-        t, q, e = self.t, self.q, self.error
+        t = self.t
+        q = self.q
+        e = self.error
         if quantity == "position":
             found = value_intervals(t, q, e)
         elif quantity == "velocity":
@@ -283,7 +287,8 @@ class _Samples:
         else:
             found = second_derivatives(t, q, e, jitter)
         for lag, bounds in zip(LAGS, islice(found, self.lags), strict=False):
-            lower, upper = limit.lower, limit.upper
+            lower = limit.lower
+            upper = limit.upper
             if limit.by_position is not None:
                 lower, upper = span_limits(q, lag, e, limit.by_position, upper)
             yield bounds, lower, upper
@@ -321,7 +326,8 @@ def _worst(
             k, joint = np.unravel_index(int(excess.argmax()), excess.shape)
             size = float(excess[k, joint])
             if size > (best[0] if best else MIN_EXCESS):
-                time, value = float(bounds.t[k]), float(values[k, joint])
+                time = float(bounds.t[k])
+                value = float(values[k, joint])
                 end = float(np.broadcast_to(ends, excess.shape)[k, joint])
                 best = size, int(joint), time, value, end
     return None if best is None else best[1:]

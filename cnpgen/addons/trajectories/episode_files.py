@@ -21,7 +21,8 @@ from cnpgen.store.files.hdf5 import open_nested_hdf5
 from cnpgen.store.files.kind import HDF5_SUFFIXES
 from cnpgen.store.files.size_limits import MAX_TABLE_BYTES
 
-STATE, ACTION = "observation.state", "action"
+STATE = "observation.state"
+ACTION = "action"
 ROBOMIMIC_KEY = "obs/robot0_joint_pos"
 NOMINAL_TOLERANCE = 1e-3  # of a period, of times that are a grid
 TIME_COLUMNS = ("t", "time", "timestamp", "time_from_start")
@@ -111,7 +112,8 @@ def _read_lerobot(folder: Path) -> Recording:
     try:
         content = read_file(folder / LEROBOT_INFO, max_bytes=MAX_TABLE_BYTES)
         info = parse_json(content.decode())
-        version, features = str(info["codebase_version"]), info["features"]
+        version = str(info["codebase_version"])
+        features = info["features"]
         names = _feature_names(features[STATE])
         robot = str(info.get("robot_type") or "")
     except (ValueError, KeyError, TypeError, IndexError) as error:
@@ -168,7 +170,8 @@ def _stated_lengths(folder: Path) -> dict[int, int]:
 
 def _feature_names(feature: Any) -> tuple[str, ...]:
     """Return the names of a feature's values: a list, a list in an object, or indices."""
-    width, names = int(feature["shape"][0]), feature.get("names")
+    width = int(feature["shape"][0])
+    names = feature.get("names")
     if isinstance(names, dict):
         names = next(iter(names.values()))
     if not isinstance(names, list) or len(names) != width:
@@ -245,7 +248,8 @@ def _read_tables(path: Path, rate: float | None) -> Recording:
     """Read one episode of each table, such as the CSV files of a folder."""
     episodes = []
     for table in read_trajectory_tables(path):
-        columns, has_units = dict[str, Array](), False
+        columns = dict[str, Array]()
+        has_units = False
         for name, values in table.columns.items():
             if values.ndim == 1 and values.dtype.kind in "biuf":
                 stated = stated_factor(name)

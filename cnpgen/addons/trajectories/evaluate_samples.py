@@ -124,7 +124,8 @@ def _draw_trajectory(
         (at for at, verdict in enumerate(found.verdicts) if not verdict.valid), 0
     )
     chosen = first if index is None else index
-    trajectory, verdict = found.trajectories[chosen], found.verdicts[chosen]
+    trajectory = found.trajectories[chosen]
+    verdict = found.verdicts[chosen]
     margins = [
         entry.margin
         for entry in verdict.conditions.values()

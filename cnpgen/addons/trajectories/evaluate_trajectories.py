@@ -209,7 +209,8 @@ def check_trajectories(
     trajectories: Sequence[Trajectory], record: ProblemRecord
 ) -> None:
     """Check that there are trajectories with the joints, the parameters and the scenes of a problem."""
-    n, names = len(record.joint_names), ", ".join(record.parameters.names)
+    n = len(record.joint_names)
+    names = ", ".join(record.parameters.names)
     problem = open_problem(record)[0]
     if not len(trajectories):
         raise UsageError("there are no trajectories", concerns="trajectories")
@@ -321,5 +322,6 @@ def _judge_assumed(
                 Decision.UNDECIDED, CONTRADICTION, duration=trajectory.duration
             )
         largest = ", ".join(f"{value:g}" for value in np.unique(max_jerk))
-        family, text = bounded, f"jerks of at most {largest} rad/s^3"
+        family = bounded
+        text = f"jerks of at most {largest} rad/s^3"
     return replace(judge(family, trajectory), assumption=text)

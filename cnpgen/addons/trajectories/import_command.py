@@ -106,7 +106,8 @@ def _report(imported: "ImportedTrajectories") -> None:
     """Print the distances of plans from their samples, and the changes of their ends, on stderr."""
     import numpy as np
 
-    plans, deviation = imported.plans, imported.deviation
+    plans = imported.plans
+    deviation = imported.deviation
     points = plans.path_control_points.shape[1]
     lines = [
         f"imported {counted(len(plans), 'plan')} with {points} control points of the path;"
@@ -141,7 +142,8 @@ def _refined(
     from cnpgen.refine.options import RefineOptions
     from cnpgen.refine.refine_plans import refine_plans
 
-    plans, fit = imported.plans, float(imported.deviation.max())
+    plans = imported.plans
+    fit = float(imported.deviation.max())
     if fit >= distance:
         raise UsageError(
             f"--stay-within must be above the distance of the plans from their samples, {fit:.2g} rad,"

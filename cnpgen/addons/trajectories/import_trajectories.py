@@ -124,10 +124,8 @@ def import_trajectories(
         _boundary(trajectory, errors, snapper, at_rest=at_rest)
         for trajectory in trajectories
     ]
-    boundaries, snapped = (
-        [boundary for boundary, _ in ends],
-        np.array([change for _, change in ends]),
-    )
+    boundaries = [boundary for boundary, _ in ends]
+    snapped = np.array([change for _, change in ends])
     max_error = MAX_FIT_ERROR_RAD + float(errors[0])
     motions, deviation = _fitted(trajectories, boundaries, record.trajectory, max_error)
     poses = [trajectory.obstacle_poses for trajectory in trajectories]

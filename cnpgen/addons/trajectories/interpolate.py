@@ -125,7 +125,8 @@ def bounded_jerk(
         # Dense samples of positions alone amplify noise: fewer of them bound
         # derivatives better.
         chosen = _thinned(trajectory.t, float(max_jerk.min()), float(noise[0]))
-        t, data = trajectory.t[chosen], [trajectory.q[chosen]]
+        t = trajectory.t[chosen]
+        data = [trajectory.q[chosen]]
         h = np.diff(t)
         nodes, weights, of_data = polynomials_of_positions(t, data[0], STENCIL)
         orders = np.zeros(nodes.shape[1], np.intp)
@@ -204,7 +205,8 @@ def polynomials_of_positions(
     shape (S, W), weights of the positions for the Bernstein coefficients, shape (S, W,
     W), and the positions, shape (S, W, n).
     """
-    size, count = min(neighbors, len(t)), len(t) - 1
+    size = min(neighbors, len(t))
+    count = len(t) - 1
     # The span is in the middle of its window, but at both ends of the samples.
     first = np.clip(np.arange(count) - (size // 2 - 1), 0, len(t) - size)
     window = first[:, None] + np.arange(size)
@@ -280,7 +282,8 @@ def _kernel_norm(
     nodes: Array, orders: NDArray[np.intp], weights: Array, order: int
 ) -> float:
     """Return the integral of one span; see ``_kernel_norms``."""
-    low, high = min(nodes.min(), 0.0), max(nodes.max(), 1.0)
+    low = min(nodes.min(), 0.0)
+    high = max(nodes.max(), 1.0)
     # Midpoints of equal parts of the window integrate the kernel.
     tau = low + (high - low) * (np.arange(KERNEL_NODES) + 0.5) / KERNEL_NODES
     u = np.linspace(0, 1, KERNEL_PHASES)

@@ -74,7 +74,9 @@ class FamilyJudge:
 
     def __init__(self, problem: Problem, robot: Robot, *, step: float = 1e-3) -> None:
         check_step(step)
-        self._problem, self._robot, self._step = problem, robot, step
+        self._problem = problem
+        self._robot = robot
+        self._step = step
         self._world, self._moved = (
             PathWorld(robot, problem.obstacle, problem.object_size) for _ in range(2)
         )
@@ -104,14 +106,16 @@ class FamilyJudge:
         if condition is None:
             # Drives whose motors alone are limited.
             return None
-        limit, allowed = condition.upper, constraint.allowed(condition)
+        limit = condition.upper
+        allowed = constraint.allowed(condition)
         return TorqueLimit(condition.name, constraint.reason, limit, allowed)
 
     def torques(
         self, q: Array, dq: Array, ddq: Array, parameters: Array | None = None
     ) -> Array:
         """Evaluate the inverse dynamics at K states of shape (K, n), shape (K, n) [N m]."""
-        rows, tip = None if parameters is None else parameters[None], np.zeros((1, 3))
+        rows = None if parameters is None else parameters[None]
+        tip = np.zeros((1, 3))
         poses = scene_of(self._problem, tip, tip, tip, rows).poses[0]
         q, dq, ddq = (np.ascontiguousarray(values.T) for values in (q, dq, ddq))
         self._moved.set_path(q, dq, ddq, poses, np.zeros_like(q))
@@ -173,7 +177,8 @@ class FamilyJudge:
                 for each in (poses, *scenes):
                     each[: len(placed)] = placed
         else:
-            poses, scenes = scene, []
+            poses = scene
+            scenes = []
         self._world.set_path(states.q, states.dq, states.ddq, poses, states.jerk)
         phase_of = trajectory.phase_of()
         context = evaluation_context(
@@ -229,7 +234,8 @@ class FamilyJudge:
             velocity = velocity + np.abs(
                 states.dq[:, -1] - family.polynomials.dq[-1, max(len(family.t) - 3, 0)]
             )
-        scenes, known = [], pose_width(self._problem.obstacle)
+        scenes = []
+        known = pose_width(self._problem.obstacle)
         for (order, bound), sign in product(
             {"q": position, "dq": velocity}.items(), (-1.0, 1.0)
         ):
@@ -274,11 +280,14 @@ def _decided(
 ) -> ConditionDecision:
     """Decide a condition by the worst margin of any curve and the largest relative violation that every curve has."""
     if margin.ok:
-        decision, reason = Decision.VALID, ""
+        decision = Decision.VALID
+        reason = ""
     elif certain > 1:
-        decision, reason = Decision.INVALID, margin.reason
+        decision = Decision.INVALID
+        reason = margin.reason
     else:
-        decision, reason = Decision.UNDECIDED, _doubt(margin, error)
+        decision = Decision.UNDECIDED
+        reason = _doubt(margin, error)
     return ConditionDecision(decision, reason, margin, error, violated, undecided)
 
 
@@ -306,18 +315,17 @@ def _limit_entries(
 
     A violation by the smooth curve leaves a limit undecided.
     """
-    entries, curves = [], [family] if smooth is None else [family, smooth]
+    entries = []
+    curves = [family] if smooth is None else [family, smooth]
     states = [curve.evaluate(samples.s, jerk=True) for curve in curves]
     bounds_at = dict(zip(ORDERS, family.bounds_at(samples.s), strict=True))
     bounds = dict(zip(ORDERS, family.bounds, strict=True))
     n = len(limits.joints)
     rows = np.arange(2 * n) % n
     for limit, constraint in enumerate(limits.constraints):
-        name, bound, scale = (
-            quantity_of(constraint),
-            limits.bounds[limit],
-            limits.scale[limit],
-        )
+        name = quantity_of(constraint)
+        bound = limits.bounds[limit]
+        scale = limits.scale[limit]
         # Violations relative to the tolerance: above 1 they count.
         nominal, *others = (
             (getattr(curve.polynomials, name)[..., rows] - bound) / scale
@@ -348,10 +356,8 @@ def _limit_entries(
             (getattr(state, name)[rows].T - bound) / scale for state in states
         )
         error_at = bounds_at[name][rows].T / np.abs(scale)
-        highest, lowest = (
-            np.max([at + error_at, *others], axis=(0, 2)),
-            (at - error_at).max(axis=1),
-        )
+        highest = np.max([at + error_at, *others], axis=(0, 2))
+        lowest = (at - error_at).max(axis=1)
         violated = _share(lowest > 1, samples.t)
         share = _share((highest > 1) & (lowest <= 1), samples.t)
         entries.append(_decided(margin, uncertainty, certain, violated, share))
@@ -360,12 +366,14 @@ def _limit_entries(
 
 def _measured_entries(context: EvaluationContext) -> list[ConditionDecision]:
     """Decide the measured conditions; the world of the context is moved."""
-    t, samples = context.samples.t, context.samples
+    t = context.samples.t
+    samples = context.samples
     worst = {
         id(condition): condition.margin(context.problem, samples)
         for condition in context.measured
     }
-    certain, masks = {}, {}
+    certain = {}
+    masks = {}
     for condition in context.measured:
         # Shares of time are measured at the samples, before the world moves.
         violated, possible = _violation_masks(context, condition)
@@ -413,10 +421,8 @@ def _violation_masks(
 ) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
     """Return masks of the samples that every curve violates, and that some curve violates, shape (K,)."""
     if is_contact(condition.constraint):
-        pairs, required = (
-            pairs_of(context.world, condition.constraint),
-            condition.condition.lower - condition.tolerance,
-        )
+        pairs = pairs_of(context.world, condition.constraint)
+        required = condition.condition.lower - condition.tolerance
         # A distance below the bound by more than the error is too small for every
         # curve.
         low = float(np.max(required - condition.uncertainty, initial=-np.inf))

@@ -32,7 +32,9 @@ MAX_DATA_FILE_MB = 100
 MAX_VIDEO_FILE_MB = 200  # there are none, but readers expect the number
 DATA_PATH = "data/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"
 EPISODES_PATH = "meta/episodes/chunk-000/file-000.parquet"
-STATE, ENVIRONMENT, ACTION = "observation.state", LEROBOT_ENVIRONMENT, "action"
+STATE = "observation.state"
+ENVIRONMENT = LEROBOT_ENVIRONMENT
+ACTION = "action"
 QUANTILES = (0.01, 0.1, 0.5, 0.9, 0.99)
 _INDICES = {
     "timestamp": "float32",
@@ -120,10 +122,13 @@ def _write_frames(
         added = sum(values.nbytes for values in columns.values())
         if size and size + added > MAX_DATA_FILE_MB * 2**20:
             _write_file(path, episodes[begin:], file)
-            begin, file, size = number, file + 1, 0
+            begin = number
+            file = file + 1
+            size = 0
         episodes.append(columns)
         files.append(file)
-        size, first = size + added, first + len(columns["index"])
+        size = size + added
+        first = first + len(columns["index"])
     _write_file(path, episodes[begin:], file)
     return episodes, files
 
@@ -179,7 +184,8 @@ def _write_episodes(
     import pyarrow
 
     lengths = np.array([len(episode["index"]) for episode in episodes])
-    ends, chunks = np.cumsum(lengths), np.divmod(files, MAX_CHUNK_FILES)
+    ends = np.cumsum(lengths)
+    chunks = np.divmod(files, MAX_CHUNK_FILES)
     table: dict[str, Any] = {
         "episode_index": np.arange(len(episodes)),
         "tasks": [[task]] * len(episodes),

@@ -40,7 +40,8 @@ def read_lerobot(folder: Path) -> Iterator[TrajectoryTable]:
         info = parse_json(
             read_file(folder / LEROBOT_INFO, max_bytes=MAX_TABLE_BYTES).decode()
         )
-        features, version = info["features"], str(info["codebase_version"])
+        features = info["features"]
+        version = str(info["codebase_version"])
         key = next(key for key in ("observation.state", "action") if key in features)
         names = _feature_names(features[key])
         described = (
@@ -114,10 +115,8 @@ def _feature_names(feature: Any) -> list[str]:
     Raises:
         TypeError, KeyError, ValueError, IndexError: It is no feature.
     """
-    width, names = (
-        int(feature["shape"][0]),
-        feature.get("names") if isinstance(feature, dict) else None,
-    )
+    width = int(feature["shape"][0])
+    names = feature.get("names") if isinstance(feature, dict) else None
     if not 0 < width <= MAX_FEATURE_WIDTH:
         raise ValueError(
             f"a feature has {width} values, expected 1 to {MAX_FEATURE_WIDTH:,}"

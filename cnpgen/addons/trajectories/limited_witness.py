@@ -176,7 +176,8 @@ class _Part:
 
         # The error of positions is the unit of the program, so its numbers are near
         # one.
-        free, unit = self.free, float(allowed[0])
+        free = self.free
+        unit = float(allowed[0])
         if not len(free):
             return None
         curvature, gradient = self._jerks(unit)
@@ -209,7 +210,9 @@ class _Part:
             for order, values in enumerate(self.data)
         ]
         groups.append((points, 2, np.zeros(len(points)), limit))
-        rows, lower, upper = [], [], []
+        rows = []
+        lower = []
+        upper = []
         for times, order, values, error in groups:
             # The variables are changes: bounds are differences from the present curve.
             now = self.spline.at(times, order)

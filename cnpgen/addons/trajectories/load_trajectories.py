@@ -182,7 +182,8 @@ def _check_meaning(
 ) -> None:
     """Refuse unused elements that say what numbers mean, unless their loss is accepted."""
     for name in ignored:
-        key, is_attribute = _key_of(name), name.startswith("attribute ")
+        key = _key_of(name)
+        is_attribute = name.startswith("attribute ")
         known = {*_OF_NAMES, *_OF_NUMBERS} if is_attribute else _OF_NAMES
         similar = nearest(key, (JOINT_NAMES, *UNIT_ATTRIBUTES), similarity=MISSPELT)
         if (key in known or similar) and key not in allowed:

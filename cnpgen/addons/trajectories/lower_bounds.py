@@ -91,9 +91,11 @@ def second_derivatives(
         low, high = _mean_intervals(t, y, lag, e, jitter)
         # The area of the hat over both spans.
         area = ((t[2 * lag :] - t[: -2 * lag]) / 2)[:, None]
-        least, most = low[lag:] - high[:-lag], high[lag:] - low[:-lag]
+        least = low[lag:] - high[:-lag]
+        most = high[lag:] - low[:-lag]
         # A larger area makes the mean smaller, but never changes its sign.
-        large, small = area + jitter, np.maximum(area - jitter, 1e-300)
+        large = area + jitter
+        small = np.maximum(area - jitter, 1e-300)
         with np.errstate(over="ignore"):
             least = np.where(least > 0, least / large, least / small)
             most = np.where(most < 0, most / large, most / small)
@@ -159,9 +161,12 @@ def _mean_intervals(
     t: Array, y: Array, lag: int, error: float, jitter: float
 ) -> tuple[Array, Array]:
     """Return the interval of the mean derivative between samples at a distance, shape (M, n) each."""
-    h, change = (t[lag:] - t[:-lag])[:, None], y[lag:] - y[:-lag]
-    low, high = change - 2 * error, change + 2 * error
-    largest, smallest = h + 2 * jitter, np.maximum(h - 2 * jitter, 1e-300)
+    h = (t[lag:] - t[:-lag])[:, None]
+    change = y[lag:] - y[:-lag]
+    low = change - 2 * error
+    high = change + 2 * error
+    largest = h + 2 * jitter
+    smallest = np.maximum(h - 2 * jitter, 1e-300)
     # A change is smallest per time over the longest possible time, but its sign decides
     # which time that is.
     with np.errstate(over="ignore"):

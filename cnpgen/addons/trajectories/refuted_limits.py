@@ -26,7 +26,9 @@ from cnpgen.judges.plans.joint_limits import ProvenJointLimits, quantity_of
 from cnpgen.judges.plans.verdict import Margin
 
 MIN_VIOLATION = 1.001  # in tolerances: rounding of the bounds proves nothing
-POSITIONS, VELOCITIES, BOTH = "positions", "velocities", "positions and velocities"
+POSITIONS = "positions"
+VELOCITIES = "velocities"
+BOTH = "positions and velocities"
 _ORDERS = ("q", "dq", "ddq", "jerk")
 
 
@@ -116,7 +118,10 @@ def _bounds(
     trajectory: Trajectory, errors: SampleErrors, largest: dict[str, Array]
 ) -> Iterator[tuple[int, str, str, Iterator[MeanDerivatives]]]:
     """Yield all bounds: order of the derivative, columns, condition, and the bounds of all distances."""
-    t, q, dq, ddq = trajectory.t, trajectory.q, trajectory.dq, trajectory.ddq
+    t = trajectory.t
+    q = trajectory.q
+    dq = trajectory.dq
+    ddq = trajectory.ddq
     # Under a limit V, a time within d moves a position by at most V d.
     moved = [
         float((largest[name] * errors.t).max()) if errors.t else 0.0

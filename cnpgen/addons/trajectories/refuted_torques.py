@@ -123,7 +123,8 @@ def _centres(t: Array, lag: int) -> NDArray[np.intp]:
     """Return the samples at the center of two spans of about equal lengths."""
     # The remainder holds for a hat with equal halves.
     centres = np.arange(lag, len(t) - lag)
-    before, after = t[centres] - t[centres - lag], t[centres + lag] - t[centres]
+    before = t[centres] - t[centres - lag]
+    after = t[centres + lag] - t[centres]
     equal = np.abs(after - before) <= MAX_UNEQUAL * np.minimum(before, after)
     return centres[equal]
 
@@ -134,7 +135,8 @@ def _mean_states(
     """Return positions at the center, mean velocities and mean accelerations over hats, shape (M, n) each."""
     # Divided differences: v_c = (q_2 - q_0) / (2 h), a = 2 (v_after - v_before) / (2
     # h).
-    first, last = centres - lag, centres + lag
+    first = centres - lag
+    last = centres + lag
     before, after = (
         (q[end] - q[start]) / (t[end] - t[start])[:, None]
         for start, end in ((first, centres), (centres, last))

@@ -59,7 +59,8 @@ class _Polynomials:
             "scw,swn->csn", differentiated(self.weights, order), self.data
         )
         # Basis polynomials B_k(u) = C(d, k) u^k (1 - u)^(d - k).
-        degree, u = len(coefficients) - 1, COMPARED_PHASES[:, None]
+        degree = len(coefficients) - 1
+        u = COMPARED_PHASES[:, None]
         k = np.arange(degree + 1)
         basis = (
             np.array([comb(degree, each) for each in k])
@@ -88,7 +89,8 @@ def resolved_curves(
     The noise is that of positions, velocities and accelerations, shape (3,);
     acceleration limits [rad/s^2], shape (n,), may be inf.
     """
-    t, data = trajectory.t, data_of(trajectory)
+    t = trajectory.t
+    data = data_of(trajectory)
     h = np.diff(t)
     if len(data) == 1:
         accurate, other = (
@@ -161,7 +163,8 @@ def _through_positions(trajectory: Trajectory, size: int, noise: Array) -> _Poly
 
 def _hermite(h: Array, data: list[Array], noise: Array) -> _Polynomials:
     """Return polynomials through derivatives at both ends of every span."""
-    weights, orders = hermite_weights(len(data)), np.tile(np.arange(len(data)), 2)
+    weights = hermite_weights(len(data))
+    orders = np.tile(np.arange(len(data)), 2)
     scaled = np.asarray(noise)[orders] * h[:, None] ** orders
     return _Polynomials(
         np.broadcast_to(weights, (len(h), *weights.shape)),

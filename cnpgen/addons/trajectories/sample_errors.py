@@ -98,7 +98,8 @@ def rounding(columns: Array) -> tuple[str, float]:
     moving = columns[:, np.ptp(columns, axis=0) > 0]
     if not moving.size:
         return "", 0.0
-    single, half_spacing = "", 0.0
+    single = ""
+    half_spacing = 0.0
     # Decimals of radians are tried before those of degrees.
     for unit, name in ((1.0, ""), (DEGREE, " of a degree")):
         values = columns / unit
@@ -108,7 +109,8 @@ def rounding(columns: Array) -> tuple[str, float]:
             half = (0.5 * 10.0**-decimals + spacing / 2) * unit
             return f"{_counted(decimals)}{name}", half
         if spacing and not single:
-            single, half_spacing = "the precision of float32", spacing / 2 * unit
+            single = "the precision of float32"
+            half_spacing = spacing / 2 * unit
     # All moving joints must show the steps of an encoder.
     steps = [_step(column) for column in moving.T]
     known = [step for step in steps if step is not None]

@@ -56,7 +56,9 @@ def smooth_curve(
 
     Given accelerations are those of the curve at the samples.
     """
-    t, q, dq = trajectory.t, trajectory.q, trajectory.dq
+    t = trajectory.t
+    q = trajectory.q
+    dq = trajectory.dq
     if dq is None or len(t) < 2 * END_SPANS + 2:
         return None
     ddq = trajectory.ddq
@@ -101,10 +103,13 @@ def smooth_curve(
 
 def estimated_derivative(trajectory: Trajectory, order: int, neighbors: int) -> Array:
     """Estimate a derivative at samples with velocities from some of their neighbors, shape (K, n)."""
-    t, q, dq = trajectory.t, trajectory.q, trajectory.dq
+    t = trajectory.t
+    q = trajectory.q
+    dq = trajectory.dq
     if dq is None:
         raise UsageError("an estimate of derivatives needs samples with velocities")
-    size, count = min(neighbors, len(t)), len(t)
+    size = min(neighbors, len(t))
+    count = len(t)
     # The window of a sample is centered on it, and shifted inward near both ends.
     first = np.clip(np.arange(count) - size // 2, 0, count - size)
     window = first[:, None] + np.arange(size)
@@ -158,7 +163,8 @@ def _end(
         columns.append(column)
     # Linear accelerations over a step d change dq by d (a_k + a_k+1) / 2. They change q
     # by d dq + d^2 (a_k / 3 + a_k+1 / 6).
-    accelerations, step = np.stack(columns, axis=1), np.diff(knots)[:, None]
+    accelerations = np.stack(columns, axis=1)
+    step = np.diff(knots)[:, None]
     velocities = dq[0] + _sums(step * (accelerations[1:] + accelerations[:-1]) / 2)
     moves = velocities[:-1] * step + step**2 * (
         accelerations[:-1] / 3 + accelerations[1:] / 6

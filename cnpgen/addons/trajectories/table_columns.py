@@ -55,7 +55,8 @@ def joint_columns(
     complete = [found for found in numbered if all(found)]
     if len(complete) == 2:
         # Such as q0 to q6 for six joints.
-        first, last = complete[0][0], complete[1][-1]
+        first = complete[0][0]
+        last = complete[1][-1]
         raise ValueError(
             f"{len(joints) + 1} columns from {first!r} to {last!r} for {len(joints)} joints:"
             " --joints names those of the problem's joints, in order"

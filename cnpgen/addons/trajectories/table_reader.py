@@ -110,7 +110,8 @@ class TableReader:
 
     def _checked(self, rows: dict[str, Any]) -> Trajectory:
         """Return the trajectory of rows with parameters and scene, after a check of its units."""
-        parameters, poses = self._parameters(), self._obstacle_poses()
+        parameters = self._parameters()
+        poses = self._obstacle_poses()
         try:
             if parameters is not None and not self.options.extrapolate:
                 self.record.parameters.checked(parameters)
@@ -191,7 +192,8 @@ class TableReader:
 
     def _check_numbered(self) -> None:
         """Check that columns without names are those of times and joints, or named by options."""
-        options, width = self.options, len(self.table.columns)
+        options = self.options
+        width = len(self.table.columns)
         if all(joint.isdecimal() for joint in options.joints):
             return
         n = len(options.joints)
@@ -241,7 +243,8 @@ class TableReader:
 
     def _times(self, count: int) -> Array:
         """Return the times of the samples [s]."""
-        name, rate = self._time_column(), self.options.rate
+        name = self._time_column()
+        rate = self.options.rate
         if rate is not None and (
             name is None or not self._has_times_of_rate(name, rate)
         ):
@@ -349,8 +352,10 @@ class TableReader:
 
     def _selected(self, name: str) -> Array:
         """Return the problem's joints of an array with one column per joint."""
-        values, joints = self._numbers(name, ndim=2), self.options.joints
-        width, named = values.shape[1], self.table.joint_names
+        values = self._numbers(name, ndim=2)
+        joints = self.options.joints
+        width = values.shape[1]
+        named = self.table.joint_names
         if named and len(named) != width:
             raise self._error(
                 f"{name} has {width} columns, joint_names has {len(named)}"
@@ -375,7 +380,8 @@ class TableReader:
 
     def _scalar_columns(self, kind: str) -> list[str] | None:
         """Return the column of every joint, or None without any."""
-        joints, table = self.options.joints, self.table
+        joints = self.options.joints
+        table = self.table
         if not table.has_head:
             if kind != "q":
                 return None
@@ -453,9 +459,7 @@ class TableReader:
 
     def _missing(self) -> str:
         """Return the message for missing positions."""
-        joint, columns = (
-            self.options.joints[0],
-            ", ".join(list(self.table.columns)[:12]),
-        )
+        joint = self.options.joints[0]
+        columns = ", ".join(list(self.table.columns)[:12])
         expected = f"q {joint}, {joint}_position, {joint} and so on, or an array q"
         return f"no columns with joint positions, expected {expected}; there are {columns or 'no columns'}"

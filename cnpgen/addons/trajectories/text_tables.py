@@ -44,7 +44,8 @@ def read_text_table(path: Path, separator: str | None) -> TrajectoryTable:
     rows = _cells(path, lines, separator)
     head = None
     if not all(map(_is_number, rows[0][1])):
-        head, rows = rows[0][1], rows[1:]
+        head = rows[0][1]
+        rows = rows[1:]
     elif comment is not None:
         names = _cells(path, [comment], _separator_of(comment[1], separator))[0][1]
         head = names if len(names) == len(rows[0][1]) else None
@@ -68,7 +69,8 @@ def _lines(path: Path) -> tuple[list[tuple[int, str]], tuple[int, str] | None]:
         text = path.read_text(encoding="utf-8-sig")
     except UnicodeDecodeError as error:
         raise UsageError(f"{path} is not a table in UTF-8: {error}") from error
-    lines, comment = list[tuple[int, str]](), None
+    lines = list[tuple[int, str]]()
+    comment = None
     for number, line in enumerate(text.splitlines(), 1):
         stripped = line.strip()
         if stripped[:1] in {*_COMMENTS} and stripped:

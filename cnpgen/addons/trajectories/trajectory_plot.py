@@ -53,7 +53,8 @@ def along_trajectory(
     Accelerations and jerks of positions alone are nan: a line between samples has none.
     """
     t = plot_times(trajectory.duration, samples, extra_times)
-    share, phase_of = t / trajectory.duration, trajectory.phase_of()
+    share = t / trajectory.duration
+    phase_of = trajectory.phase_of()
     q, dq, ddq = (np.ascontiguousarray(values.T) for values in trajectory.states(t))
     jerk = np.ascontiguousarray(trajectory.jerks(t).T) if problem.uses_jerk else None
     if trajectory.dq is None:
@@ -61,7 +62,8 @@ def along_trajectory(
         jerk = None if jerk is None else ddq
     world = PathWorld(robot, problem.obstacle, problem.object_size)
     world.set_path(q, dq, ddq, place_obstacles(problem.obstacle), jerk)
-    tip, velocity = world.tip_position.T, world.tip_velocity.T
+    tip = world.tip_position.T
+    velocity = world.tip_velocity.T
     parameters = None if trajectory.parameters is None else trajectory.parameters[None]
     poses = trajectory.obstacle_poses
     scene = scene_of(

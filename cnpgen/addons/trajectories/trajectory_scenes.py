@@ -69,7 +69,8 @@ def problem_of_samples(problem: object) -> ProblemRecord:
     if not isinstance(problem, str | Path):
         return as_record(problem)
     with concerning("problem"):
-        path, errors = find_recipe(_KINDS, problem), list[str]()
+        path = find_recipe(_KINDS, problem)
+        errors = list[str]()
         table = read_table(path, _KINDS, errors) or {}
         if {"pipeline", "problem"} & table.keys():
             return record_problem(load_dataset_recipe(path).pipeline.problem)

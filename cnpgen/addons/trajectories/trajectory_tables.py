@@ -103,7 +103,8 @@ def holds_trajectories(path: Path) -> bool:
         return not (path / SPECIFICATION).exists() and any(
             is_trajectory_file(file) for file in path.iterdir()
         )
-    suffix, tables = path.suffix.lower(), sorted(_READERS.keys() - {*HDF5_SUFFIXES})
+    suffix = path.suffix.lower()
+    tables = sorted(_READERS.keys() - {*HDF5_SUFFIXES})
     if suffix in tables:
         return True
     if suffix not in HDF5_SUFFIXES:

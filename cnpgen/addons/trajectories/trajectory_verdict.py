@@ -74,7 +74,8 @@ class ConditionDecision:
 
     def to_dict(self) -> dict[str, Any]:
         """Return the decision for JSON; values that were not measured are None."""
-        margin, known = self.margin.to_dict(), self.is_measured
+        margin = self.margin.to_dict()
+        known = self.is_measured
         if not known:
             margin |= {"value": None, "violation": None}
         return {

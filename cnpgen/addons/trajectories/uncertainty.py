@@ -116,11 +116,13 @@ def _friction_changes(
     Friction changes within a few samples about a reversal, which the midpoint of a
     block may miss. It rises with the velocity, so both ends of the velocities bound it.
     """
-    drive, is_torque = world.robot.drive, isinstance(condition.constraint, JointTorque)
+    drive = world.robot.drive
+    is_torque = isinstance(condition.constraint, JointTorque)
     parts = condition.condition.parts
     if drive is None or not is_torque or not parts:
         return 0.0
-    dq, error = family.evaluate(s, jerk=False).dq, family.bounds_at(s)[1]
+    dq = family.evaluate(s, jerk=False).dq
+    error = family.bounds_at(s)[1]
     # Rows of a condition may be some joints only.
     joints = [world.robot.joint_names.index(part) for part in parts]
     nominal = friction_bounds(drive, dq)

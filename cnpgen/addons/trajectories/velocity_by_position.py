@@ -57,7 +57,9 @@ def span_limits(
         largest: Constant limits V [rad/s], shape (n,).
     """
     slope, offset, low, high = by_position
-    a, b, e = q[:-lag], q[lag:], error
+    a = q[:-lag]
+    b = q[lag:]
+    e = error
     upper = _largest_mean(high - a - e, high - b + e, slope, offset, largest)
     return -_largest_mean(a - e - low, b + e - low, slope, offset, largest), upper
 
@@ -81,8 +83,10 @@ def _time_to_end(x: Array, slope: Array, offset: Array, largest: Array) -> Array
     """
     least = MIN_SHARE * largest
     # Values of w at which L equals the least and the largest limit, and their distances.
-    slow, fast = least + offset, largest + offset
-    near, far = slow**2 / slope, fast**2 / slope
+    slow = least + offset
+    fast = largest + offset
+    near = slow**2 / slope
+    far = fast**2 / slope
     w = np.sqrt(slope * np.clip(x, near, far))
     between = 2 / slope * (w - slow + offset * np.log((w - offset) / least))
     return np.minimum(x, near) / least + between + np.maximum(x - far, 0) / largest
@@ -119,20 +123,24 @@ class VelocityByPosition(Constraint):
     def _below(
         self, robot: Robot, q: Any, dq: Any, maximum: Any
     ) -> tuple[Condition, ...]:
-        n, g = robot.n, []
+        n = robot.n
+        g = []
         s, o, *ends = self.by_position(n).tolist()
         for end, sign in zip(ends, (-1, 1), strict=True):
             for j in range(n):
                 # The maximum keeps the root, and its derivative, away from zero.
                 square = maximum(s[j] * sign * (end[j] - q[j]), o[j] ** 2)
                 g.append(sign * dq[j] - square**0.5 + o[j])
-        unit, parts = robot.units("rad/s"), robot.joint_names
-        none, zero = np.full(2 * n, -np.inf), np.zeros(2 * n)
+        unit = robot.units("rad/s")
+        parts = robot.joint_names
+        none = np.full(2 * n, -np.inf)
+        zero = np.zeros(2 * n)
         return (Condition(NAME, unit, g, none, zero, "velocity", (*parts, *parts)),)
 
     def by_position(self, n: int) -> Array:
         """Return slopes, offsets, lower and upper ends of n joints, shape (4, n)."""
-        slope, offset = self.slope.values, self.offset.values
+        slope = self.slope.values
+        offset = self.offset.values
         if len(self.ends) != n or not {len(slope), len(offset)} <= {1, n}:
             text = f"{n} joints need {n} ends, and one or {n} slopes and offsets"
             raise RecipeError([f"velocity-by-position: {text}"])
@@ -157,8 +165,11 @@ class VelocityByPosition(Constraint):
         """
         if not np.isfinite(largest).all():
             return None
-        best, found = MIN_PROVEN, None
-        t, q, e = trajectory.t, trajectory.q, errors.q
+        best = MIN_PROVEN
+        found = None
+        t = trajectory.t
+        q = trajectory.q
+        e = errors.q
         # An offset that is smaller by the tolerance raises the limit by as much.
         rows = self.by_position(len(joints)) - np.array([[0, self.tolerance, 0, 0]]).T
         means = first_derivatives(t, q, e, errors.t)

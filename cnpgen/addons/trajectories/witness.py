@@ -92,7 +92,8 @@ def fitted(
     trajectory: Trajectory, errors: SampleErrors, jitter_share: float
 ) -> _Splines | None:
     """Return the splines with the largest weights whose differences are within the errors."""
-    data, t = data_of(trajectory), trajectory.t
+    data = data_of(trajectory)
+    t = trajectory.t
     allowed = np.maximum(errors.values, MIN_ERRORS)[: len(data)]
     # A value measured within d of its time differs by at most its rate times d.
     rates = [np.abs(np.gradient(values, t, axis=0)) for values in data]
@@ -144,12 +145,15 @@ def _equations(t: Array, data: list[Array], errors: Array) -> _NormalEquations:
     # each value, so that errors of exact samples can vanish.
     inner = np.repeat(t[1:-1], len(data))
     knots = np.concatenate([[t[0]] * (DEGREE + 1), inner, [t[-1]] * (DEGREE + 1)])
-    scaled, times = knots / h, t / h
+    scaled = knots / h
+    times = t / h
     # The last sample must not lie beyond the last knot by rounding, where the basis
     # ends.
     times[-1] = scaled[-1]
     # Rows of derivatives are those of lower degree times differences of coefficients.
-    rows, total, right = np.eye(1), 0.0, 0.0
+    rows = np.eye(1)
+    total = 0.0
+    right = 0.0
     difference: Any = None
     for order, values in enumerate(data):
         basis = BSpline.design_matrix(
@@ -202,7 +206,8 @@ def is_within(
     splines: "SplinesOfJoints", trajectory: Trajectory, errors: SampleErrors
 ) -> bool:
     """Return whether splines meet every sample within its errors at one time within the jitter."""
-    t, data = trajectory.t, data_of(trajectory)
+    t = trajectory.t
+    data = data_of(trajectory)
     # The relative share is for rounding in the evaluation of splines.
     allowed = np.maximum(errors.values, MIN_ERRORS) * (1 + 1e-9)
     met = np.zeros(len(t), bool)

@@ -156,7 +156,8 @@ class _Server(ThreadingHTTPServer):
     daemon_threads = True
 
     def __init__(self, page: Page, watched: Sequence[Path], port: int) -> None:
-        self.watched, self._page = watched, page
+        self.watched = watched
+        self._page = page
         # Pages are drawn one after the other.
         self._drawing = Lock()
         super().__init__((HOST, port), _Handler)

@@ -59,7 +59,8 @@ def robot_bodies(
     if visual and sum(len(body.triangles) for body in visual) <= MAX_TRIANGLES:
         return visual, "meshes"
     if robot.shape is not None:
-        parts, joints = robot.shape.convex_parts, robot.shape.joints
+        parts = robot.shape.convex_parts
+        joints = robot.shape.joints
         return [
             wrapped(each.link, joints[each.link], each.vertices, each.radius)
             for each in parts
@@ -83,7 +84,8 @@ def planned_joints(robot: Robot) -> tuple[list[dict[str, Any]], list[float]]:
     """Return the planned joints and the placement of the tip, by columns, from which the page computes poses."""
     import pinocchio as pin
 
-    model, data = robot.model, robot.model.createData()
+    model = robot.model
+    data = robot.model.createData()
     pin.forwardKinematics(model, data, np.full(robot.n, PROBE))
     joints = []
     for index, name in enumerate(robot.joint_names):
@@ -159,10 +161,8 @@ def _ball() -> Array:
     # Meridians include both poles; around the circle, the last turn would repeat the
     # first.
     turns = np.arange(4 * BALL) * np.pi / (2 * BALL)
-    level, height = (
-        np.sin(angles)[:, None],
-        np.broadcast_to(np.cos(angles)[:, None], (len(angles), len(turns))),
-    )
+    level = np.sin(angles)[:, None]
+    height = np.broadcast_to(np.cos(angles)[:, None], (len(angles), len(turns)))
     return np.unique(
         np.stack(
             [level * np.cos(turns), level * np.sin(turns), height], axis=-1
@@ -203,7 +203,8 @@ def _line(robot: Robot, radius: float) -> Iterator[Body]:
     """Return the segments of an arm that is a line through its joints' origins, each moved by the joint at its end."""
     import pinocchio as pin
 
-    model, data = robot.model, robot.model.createData()
+    model = robot.model
+    data = robot.model.createData()
     pin.framesForwardKinematics(model, data, pin.neutral(model))
     origins = [data.oMi[i].translation for i in range(1, model.njoints)]
     origins.append(data.oMf[robot.tip_frame].translation)

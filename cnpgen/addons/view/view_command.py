@@ -125,7 +125,8 @@ def _scene(arguments: argparse.Namespace) -> "ViewScene":
     from cnpgen.store.files.kind import HDF5_SUFFIXES
     from cnpgen.store.paths import file_kind
 
-    what, rows = Path(arguments.what), arguments.rows or (arguments.row or 0,)
+    what = Path(arguments.what)
+    rows = arguments.rows or (arguments.row or 0,)
     if len(rows) > MAX_ROWS_OF_PAGE:
         raise UsageError(
             f"--rows: expected at most {MAX_ROWS_OF_PAGE} rows on one page, got {len(rows)}"

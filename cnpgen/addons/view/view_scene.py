@@ -44,7 +44,8 @@ MIN_DRAWN_HEIGHT_M = 0.1
 DRAWN_TABLE_M = 5e-3  # thickness of a drawn table
 TIP_PATH_RADIUS_M = 4e-3
 TRIAD_LENGTH_M, TRIAD_RADIUS_M = 0.12, 4e-3  # axes of a drawn frame
-PUCK_HEIGHT_M, MALLET_HEIGHT_M = 0.012, 0.05
+DRAWN_PUCK_HEIGHT_M = 0.012
+DRAWN_MALLET_HEIGHT_M = 0.05
 DISC_CORNERS = 48
 SHARE_DIGITS = 4  # of shares of limits
 CURVE_DIGITS = 5  # significant ones of conditions
@@ -196,7 +197,8 @@ def _moving(  # noqa: PLR0917 - all of them are shown
     verdict: Verdict,
 ) -> View:
     """Show one motion at phases s and times [s], shape (K,)."""
-    curves, shares = condition_curves(problem, world, s), shares_of_limits(world)
+    curves = condition_curves(problem, world, s)
+    shares = shares_of_limits(world)
     poses = _poses(robot, world.q)
     return View(
         title=title,
@@ -241,7 +243,8 @@ def _verdict(
         point = _point(
             margin, by_name.get(margin.name), poses[frame], frame, joints
         ).tolist()
-        name, text = f"{margin.name} {margin.part}".strip(), _margin_text(margin)
+        name = f"{margin.name} {margin.part}".strip()
+        text = _margin_text(margin)
         causes.append(
             {
                 "name": name,
@@ -260,7 +263,8 @@ def _margin_text(margin: Margin) -> str:
         return "not measured: the samples do not determine it"
     factor, unit = plot_unit(margin.unit)
     side = "outside" if margin.violation > 0 else "inside"
-    amount, tolerance = factor * abs(margin.violation), factor * margin.tolerance
+    amount = factor * abs(margin.violation)
+    tolerance = factor * margin.tolerance
     return f"{amount:.3g} {unit} {side}, tolerance {tolerance:.3g} {unit}"
 
 
@@ -313,10 +317,8 @@ def _still(  # noqa: PLR0917 - all of them are shown
     verdict: dict[str, Any] | None = None,
 ) -> View:
     """Show configurations without a motion."""
-    times, poses = (
-        [float(frame) for frame in range(len(labels))],
-        _poses(robot, q).swapaxes(2, 3),
-    )
+    times = [float(frame) for frame in range(len(labels))]
+    poses = _poses(robot, q).swapaxes(2, 3)
     return View(
         title, labels, times, q.T, poses, list(_world(problem, scene)), verdict=verdict
     )
@@ -326,11 +328,13 @@ def _scene(
     problem: Problem, robot: Robot, views: list[View], *, with_meshes: bool
 ) -> ViewScene:
     bodies, kind = robot_bodies(problem, robot, with_meshes=with_meshes)
-    size, contact, tip = problem.object_size, problem.first(PuckContact), robot.n + 1
+    size = problem.object_size
+    contact = problem.first(PuckContact)
+    tip = robot.n + 1
     disc = (
         None
         if contact is None
-        else _disc_corners(np.zeros(3), contact.mallet_radius, MALLET_HEIGHT_M)
+        else _disc_corners(np.zeros(3), contact.mallet_radius, DRAWN_MALLET_HEIGHT_M)
     )
     # The index after the last joint is that of the tip.
     held = [] if size is None else [wrapped("object", tip, CUBE * np.array(size), 0.0)]
@@ -367,10 +371,8 @@ def _poses(robot: Robot, q: Array) -> Array:
     for joint, (rotation, position) in enumerate(
         zip(rotations, positions, strict=True)
     ):
-        poses[:, joint, :3, :3], poses[:, joint, :3, 3] = (
-            rotation.transpose(2, 0, 1),
-            position.T,
-        )
+        poses[:, joint, :3, :3] = rotation.transpose(2, 0, 1)
+        poses[:, joint, :3, 3] = position.T
     poses[..., 3, 3] = 1.0
     # The pose of the tip is that of the last joint times a fixed placement.
     poses[:, -1] = (
@@ -399,7 +401,8 @@ def _world(problem: Problem, scene: Scene) -> Iterator[Body]:
             yield wrapped(
                 obstacle.name, 0, solid.position + solid.corners, solid.radius
             )
-    contact, table = problem.first(PuckContact), problem.first(Table)
+    contact = problem.first(PuckContact)
+    table = problem.first(Table)
     if table is not None:
         values = scene.poses[0, problem.scene_columns.parameters]
         low, high = table.bounds_of(
@@ -415,7 +418,7 @@ def _world(problem: Problem, scene: Scene) -> Iterator[Body]:
             corners = _disc_corners(
                 np.array([x, y, table.z if table else 0.0]),
                 contact.puck_radius,
-                PUCK_HEIGHT_M,
+                DRAWN_PUCK_HEIGHT_M,
             )
             yield wrapped("puck", 0, _on_table(problem, scene, corners), 0.0)
 

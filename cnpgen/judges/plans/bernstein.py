@@ -42,13 +42,17 @@ class PiecewisePolynomials:
 
 def polynomials(motion: Motion, *, jerk: bool = False) -> PiecewisePolynomials:
     """Return the polynomials of one motion, optionally with those of its jerks."""
-    degree, path, rate = motion.degree, motion.path[0], motion.rate[0, :, None]
+    degree = motion.degree
+    path = motion.path[0]
+    rate = motion.rate[0, :, None]
     edges = knots(len(path), len(rate), degree)
     p, p1, p2, *p3 = bernstein_coefficients(path, degree, range(3 + jerk), edges)
     r, r1, *r2 = bernstein_coefficients(rate, degree, range(2 + jerk), edges)
     # dq = p' r and r' r share one product
-    first, r_r = _product(np.concatenate([p1, r1], axis=2), r), _product(r, r)
-    dq, r1_r = first[..., :-1], first[..., -1:]
+    first = _product(np.concatenate([p1, r1], axis=2), r)
+    r_r = _product(r, r)
+    dq = first[..., :-1]
+    r1_r = first[..., -1:]
     # p'' r^2 + p' r' r
     ddq = _product(p2, r_r) + _product(p1, r1_r)
     if not jerk:
@@ -81,11 +85,9 @@ def find_maximum(
     starts = np.arange(parts)[:, None] / parts
     span, of_row = (rows.max(axis=0) > _search_threshold(best, threshold)).nonzero()
     # A width of an interval for each coefficient vector; ``of_row`` is its function.
-    coefficients, left, width = (
-        rows[:, span, of_row],
-        edges[span],
-        (edges[1:] - edges[:-1])[span],
-    )
+    coefficients = rows[:, span, of_row]
+    left = edges[span]
+    width = (edges[1:] - edges[:-1])[span]
     for _ in range(MAX_SUBDIVISIONS):
         if not len(span):
             break
@@ -94,7 +96,8 @@ def find_maximum(
         halved = _subdivision(len(rows), parts) @ coefficients
         coefficients = halved.reshape(len(rows), -1)
         left = (left + starts * width).ravel()
-        width, of_row = np.tile(width / parts, parts), np.tile(of_row, parts)
+        width = np.tile(width / parts, parts)
+        of_row = np.tile(of_row, parts)
         for values, s in ((coefficients[0], left), (coefficients[-1], left + width)):
             top = int(values.argmax())
             if values[top] > best:
@@ -102,8 +105,10 @@ def find_maximum(
         # Parts whose upper bound exceeds the new maximum are subdivided again.
         upper_bounds = coefficients.max(axis=0)
         (span,) = (upper_bounds > _search_threshold(best, threshold)).nonzero()
-        coefficients, of_row = coefficients[:, span], of_row[span]
-        left, width = left[span], width[span]
+        coefficients = coefficients[:, span]
+        of_row = of_row[span]
+        left = left[span]
+        width = width[span]
     return best, int(at[0]), at[1]
 
 
@@ -187,7 +192,8 @@ def _product(a: Array, b: Array) -> Array:
     """Multiply functions (i + 1, S, n) by one function (j + 1, S, 1), span by span."""
     # Order of the axes: one matrix per span, built from b, multiplies all functions of
     # the span.
-    i, j = len(a) - 1, len(b) - 1
+    i = len(a) - 1
+    j = len(b) - 1
     times_b = (b[..., 0].T @ _products(i, j)).reshape(-1, i + j + 1, i + 1)
     result = np.empty((i + j + 1, *a.shape[1:]))
     np.matmul(times_b, a.swapaxes(0, 1), out=result.swapaxes(0, 1))

@@ -176,11 +176,10 @@ def _distance_curves(
     count = len(closest.distance)
     least = np.full(count, 1e3 * (float(stated.lower[0]) - radius))
     names = [name_part(problem, constraint, stated, i) for i in range(len(stated.g))]
-    pairs, tolerance = (
-        tuple(names[pair] for pair in closest.pair),
-        1e3 * float(constraint.allowed(stated)[0]),
-    )
-    values, unbounded = 1e3 * closest.distance[None], np.full(count, np.inf)
+    pairs = tuple(names[pair] for pair in closest.pair)
+    tolerance = 1e3 * float(constraint.allowed(stated)[0])
+    values = 1e3 * closest.distance[None]
+    unbounded = np.full(count, np.inf)
     name = stated.name
     yield ConditionCurve(
         name,

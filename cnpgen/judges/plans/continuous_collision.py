@@ -120,7 +120,8 @@ def _intervals(
     motion_bounds: Array,
 ) -> list[Intervals]:
     """Return the intervals of each contact between neighbors in rows of phases, shape (rows, K), where the world is."""
-    world, last = context.world, s.shape[1] - 1
+    world = context.world
+    last = s.shape[1] - 1
     # |x(q2) - x(q1)| <= sum over joints of (reach of the joint) |q2_j - q1_j|
     displacements = motion_bounds @ np.abs(world.q[:, 1:] - world.q[:, :-1])
     # Between rows there is no interval.
@@ -172,9 +173,7 @@ def chord_deviation_bounds(curve: Curve, s: Array, motion_bounds: Array) -> Arra
     curvature = (second + first * (first + 2 * proximal)) @ motion_bounds
     # The spans of both neighbors: an interval is at most a part of a span, so it meets
     # no third one.
-    low, high = (
-        np.searchsorted(edges[1:-1], s[:-1], "right"),
-        np.searchsorted(edges[1:-1], s[1:], "left"),
-    )
+    low = np.searchsorted(edges[1:-1], s[:-1], "right")
+    high = np.searchsorted(edges[1:-1], s[1:], "left")
     step = np.maximum(s[1:] - s[:-1], 0.0)
     return np.asarray(step**2 / 8 * np.maximum(curvature[low], curvature[high]))

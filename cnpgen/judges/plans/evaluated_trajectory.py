@@ -67,7 +67,8 @@ def evaluate_at_phases(
 ) -> EvaluatedTrajectory:
     """Evaluate one motion as ``evaluate_trajectory``, up to rounding, with cached bases of the splines."""
     orders = PATH_ORDERS + jerk
-    path, rate = motion.path[0].T, motion.rate[0]
+    path = motion.path[0].T
+    rate = motion.rate[0]
     # One product for all derivatives: bases of orders 0, 1, ... side by side.
     p = (path @ _bases(path.shape[1], motion.degree, orders, phases)).reshape(
         len(path), orders, -1
@@ -117,7 +118,8 @@ class SplineCurve:
 
     def derivative_bounds(self) -> tuple[Array, Array, Array]:
         """Bound derivatives by Bernstein coefficients of the path."""
-        path, degree = self.motion.path[0], self.motion.degree
+        path = self.motion.path[0]
+        degree = self.motion.degree
         # Shorter parts than spans: coefficients of a part are closer to the function.
         edges = np.linspace(0, 1, BOUND_PARTS * (len(path) - degree) + 1)
         first, second = (

@@ -147,12 +147,11 @@ class ProvenJointLimits:
 
     def _at_samples(self, values: Array, s: Array) -> list[Maximum]:
         """Return the maximum relative violation of each limit by values of shape (L, n, K) at phases s."""
-        violations, maxima = (
-            self._relative_violations(values.min(axis=2), values.max(axis=2)),
-            [],
-        )
+        violations = self._relative_violations(values.min(axis=2), values.max(axis=2))
+        maxima = []
         for limit, row in enumerate(violations.argmax(axis=1).tolist()):
-            below, joint = row < len(self.joints), row % len(self.joints)
+            below = row < len(self.joints)
+            joint = row % len(self.joints)
             series = values[limit, joint]
             maxima.append(
                 (
@@ -198,11 +197,9 @@ class ProvenJointLimits:
     def margin_at(self, limit: int, maximum: Maximum, time: float) -> Margin:
         """Return the margin of a limit at its maximum relative violation and the time of it [s]."""
         (relative, row, phase), condition = maximum, self.conditions[limit]
-        bound, offset, part = (
-            self.bounds[limit, row],
-            relative * self.scale[limit, row],
-            row % len(self.joints),
-        )
+        bound = self.bounds[limit, row]
+        offset = relative * self.scale[limit, row]
+        part = row % len(self.joints)
         return Margin(
             condition.name,
             self.constraints[limit].reason,

@@ -120,7 +120,9 @@ class Judge:
         tracking_error: TrackingError | None = None,
     ) -> None:
         check_step(step)
-        self._problem, self._robot, self._step = problem, robot, step
+        self._problem = problem
+        self._robot = robot
+        self._step = step
         self._world = PathWorld(robot, problem.obstacle, problem.object_size)
         self._limits = joint_limits(problem, self._world)
         self._paper = find_rules("paper")
@@ -312,7 +314,8 @@ def _corners(
 def _check_shapes(
     robot: Robot, motion: Motion, boundary: Boundary, scene: Scene, goal_xyz: Array
 ) -> None:
-    n_plans, n = len(motion), robot.n
+    n_plans = len(motion)
+    n = robot.n
     expected = {
         "path control points": (motion.path, (n_plans, *motion.path.shape[1:2], n)),
         "rate control points": (motion.rate, (n_plans, *motion.rate.shape[1:2])),

@@ -63,7 +63,8 @@ class _SampledValues:
         if not len(row):
             return row, row, np.empty((0, 2))
         chosen = np.argsort(-maxima[row, k], kind="stable")[:MAX_PEAK_INTERVALS]
-        row, k = row[chosen], k[chosen]
+        row = row[chosen]
+        k = k[chosen]
         # Rows share their phases at first; they have their own after a division.
         phases = np.broadcast_to(self.s, self.violation.shape)
         return (
@@ -93,7 +94,8 @@ def check_local_maxima(
         context.move(s.ravel())
         values = _SampledValues(of, part, s, np.empty_like(s))
         for k in np.unique(of).tolist():
-            measured, rows = _measured_again(context, smooth[k], s.ravel()), of == k
+            measured = _measured_again(context, smooth[k], s.ravel())
+            rows = of == k
             yield smooth[k], context.margin(measured, s.ravel())
             values.violation[rows] = measured.relative_violation.reshape(-1, *s.shape)[
                 part[rows], rows
@@ -131,7 +133,8 @@ def _initial_values(s: Array, measured: Sequence[MeasuredCondition]) -> _Sampled
             np.diff(np.floor(s / MIN_PHASE_STEP), prepend=-1.0) > 0
         )
         distinct = distinct[np.diff(s[distinct], prepend=-1.0) > MIN_PHASE_STEP / 2]
-        s, violation = s[distinct], violation[:, distinct]
+        s = s[distinct]
+        violation = violation[:, distinct]
     return _SampledValues(of, part, s[None], violation)
 
 
@@ -141,14 +144,16 @@ def _estimated_maxima(s: Array, values: Array) -> Array:
     # two samples the function is at most the parabola with the largest plausible |C|
     # through them: its apex lies (c - |rise|)^2 / (4 c) above the higher sample, with
     # c = C step^2 / 2, if it lies between them at all (c > |rise|).
-    step, rise = s[:, 1:] - s[:, :-1], values[:, 1:] - values[:, :-1]
+    step = s[:, 1:] - s[:, :-1]
+    rise = values[:, 1:] - values[:, :-1]
     rate = rise / step
     second = (rate[:, 1:] - rate[:, :-1]) / ((step[:, 1:] + step[:, :-1]) / 2)
     around = np.concatenate(
         [second[:, :1], second[:, :1], second, second[:, -1:], second[:, -1:]], axis=1
     )
     # At both ends of an interval and next to it.
-    low, high = _of_four(np.minimum, around), _of_four(np.maximum, around)
+    low = _of_four(np.minimum, around)
+    high = _of_four(np.maximum, around)
     # Curvature estimates are wrong by the spread of the four around an interval: with
     # low the most negative one, -low + (high - low) bounds the curvature downwards.
     curvature = np.maximum((high - 2 * low) * (step**2 / 2), MIN_CURVATURE)

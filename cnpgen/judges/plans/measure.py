@@ -52,10 +52,8 @@ def boundary_margins(
     """
     margins = []
     for quantity, (name, unit, tolerance) in BOUNDARY_TOLERANCES.items():
-        start, goal = (
-            getattr(boundary, f"start_{quantity}"),
-            getattr(boundary, f"goal_{quantity}"),
-        )
+        start = getattr(boundary, f"start_{quantity}")
+        goal = getattr(boundary, f"goal_{quantity}")
         # Only the start is prescribed if the goal is free.
         expected = start if goal is None else np.concatenate([start, goal])
         # At the start and at the goal.
@@ -98,10 +96,8 @@ class MeasuredCondition:
     def violation(self) -> Array:
         """Signed distances of the values outside their bounds at most, negative inside, shape (m, K)."""
         # Positive outside. A relaxed bound or an uncertain value shifts the violation.
-        below, above = (
-            self.condition.lower[:, None] - self.g,
-            self.g - self.condition.upper[:, None],
-        )
+        below = self.condition.lower[:, None] - self.g
+        above = self.g - self.condition.upper[:, None]
         return np.asarray(np.maximum(below, above) - self.relaxation + self.uncertainty)
 
     @cached_property
@@ -115,11 +111,9 @@ class MeasuredCondition:
         """Return the margin where the motion comes closest to a violation, or violates the condition most."""
         # argmax returns the first nan, if any.
         part, k = divmod(int(self.relative_violation.argmax()), len(samples.s))
-        low, high, g = (
-            self.condition.lower[part],
-            self.condition.upper[part],
-            self.g[part, k],
-        )
+        low = self.condition.lower[part]
+        high = self.condition.upper[part]
+        g = self.g[part, k]
         violation = float(self.violation[part, k])
         return Margin(
             self.condition.name,

@@ -19,7 +19,8 @@ def metrics_of(
     drive = robot.drive
     limit = robot.torque_limit if drive is None else drive.torque_limit
     torque_ratio = world.linear_torque / limit[:, None]
-    table, tip = problem.first(Table), world.parameters.on_table(world.tip_position)
+    table = problem.first(Table)
+    tip = world.parameters.on_table(world.tip_position)
     upright = any(isinstance(constraint, Vertical) for constraint in problem.constraint)
     return Metrics(
         duration=float(samples.t[-1]),

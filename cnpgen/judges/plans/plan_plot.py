@@ -33,7 +33,11 @@ PLOT_SAMPLES = 1000  # in time
 DRAWN_STATES = 7  # at which the arm and the object are drawn
 MAX_NAMED_CURVES = 6  # more names would cover each other
 MAX_LEGEND_CHARACTERS = 115  # that fit above the curves
-_START, _BETWEEN, _GOAL, _LIMIT, _BOX = "tab:blue", "0.55", "tab:red", "0.25", "0.85"
+_START = "tab:blue"
+_BETWEEN = "0.55"
+_GOAL = "tab:red"
+_LIMIT = "0.25"
+_BOX = "0.85"
 
 
 def plot_plan(
@@ -177,11 +181,10 @@ def plot_times(duration: float, samples: int, extra: Sequence[float]) -> Array:
 def shares_of_limits(world: PathWorld) -> dict[str, Array]:
     """Return q, dq, ddq, torque and, if constrained, jerk as fractions of their limits, each of shape (n, K)."""
     # Positions relative to the center of the range, so that both limits are at 100 %.
-    robot, factors = world.robot, world.parameters.values
-    center, half = (
-        (robot.position_upper + robot.position_lower) / 2,
-        (robot.position_upper - robot.position_lower) / 2,
-    )
+    robot = world.robot
+    factors = world.parameters.values
+    center = (robot.position_upper + robot.position_lower) / 2
+    half = (robot.position_upper - robot.position_lower) / 2
     return {
         "position": (world.q - center[:, None]) / half[:, None],
         "velocity": world.dq
@@ -199,7 +202,8 @@ def shares_of_limits(world: PathWorld) -> dict[str, Array]:
 
 def _torque_shares(world: PathWorld) -> dict[str, Array]:
     """Return the limited torques at the joints and, with drives, the larger bound of those at the motors."""
-    robot, drive = world.robot, world.robot.drive
+    robot = world.robot
+    drive = world.robot.drive
     joint = {"torque": world.torque / robot.torque_limit[:, None]}
     if drive is None:
         return joint
@@ -224,7 +228,8 @@ def _draw_joints(
     figure: "SubFigure", world: PathWorld, t: Array, margins: Sequence[Margin]
 ) -> None:
     """Draw the quantities of ``shares_of_limits`` of every joint over time."""
-    robot, shares = world.robot, shares_of_limits(world)
+    robot = world.robot
+    shares = shares_of_limits(world)
     axes = figure.subplots(len(shares), 1, sharex=True)
     for axis, (name, share) in zip(axes, shares.items(), strict=True):
         for values, joint in zip(share, robot.joint_names, strict=True):
@@ -280,7 +285,8 @@ def _draw_conditions(
 def _draw_values(axis: "Axes", curve: ConditionCurve, t: Array) -> None:
     """Draw the values of one condition, and shade the area outside its bounds."""
     for values, part in zip(curve.values, curve.parts, strict=True):
-        color, label = None if part else "black", part or None
+        color = None if part else "black"
+        label = part or None
         axis.plot(t, values, linewidth=1.2, color=color, label=label)
         if len(curve.parts) <= MAX_NAMED_CURVES:
             at = (t[0], values[0])
@@ -291,7 +297,8 @@ def _draw_values(axis: "Axes", curve: ConditionCurve, t: Array) -> None:
         if np.isfinite(bound).all():
             axis.plot(t, bound, color=_LIMIT, linewidth=1, linestyle="--")
             reach = bound + side * 1.5 * curve.tolerance
-            low, high = min(low, float(reach.min())), max(high, float(reach.max()))
+            low = min(low, float(reach.min()))
+            high = max(high, float(reach.max()))
             outside = bound + side * 1e6
             axis.fill_between(
                 t, bound, outside, color="tab:red", alpha=0.08, linewidth=0

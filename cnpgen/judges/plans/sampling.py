@@ -22,7 +22,8 @@ SAMPLES_PER_END = 64  # additional, at each end
 END_REGION = 0.05  # phases at each end with additional samples
 MIN_PHASE_STEP = 1e-7  # differences between closer samples are rounding errors
 # Samples of early_exit, which has none in time.
-EARLY_EXIT_PER_SPAN, EARLY_EXIT_PER_END = 8, 16
+EARLY_EXIT_PER_SPAN = 8
+EARLY_EXIT_PER_END = 16
 
 
 @dataclass(frozen=True)
@@ -124,7 +125,8 @@ def _nodes(points: int, degree: int, cells: int) -> Array:
     phases, halves = _table_phases(cells)
     # Two-point Gauss rule: nodes at center +- h / sqrt(3) with weights h, h half the
     # width.
-    centers, offset = (phases[1:] + phases[:-1]) / 2, halves / np.sqrt(3)
+    centers = (phases[1:] + phases[:-1]) / 2
+    offset = halves / np.sqrt(3)
     return basis_matrix(
         np.stack([centers - offset, centers + offset], axis=1).ravel(), points, degree
     )

@@ -64,7 +64,8 @@ class TrackingTube:
         unit = "m" if all(robot.prismatic) else "rad"
         check_range("tracking_error", values, 0.0, MAX_TRACKING_ERROR, unit)
         # Motion bounds of the whole tube need positions that include the error.
-        self._problem, self._error = problem, np.broadcast_to(values, robot.n).copy()
+        self._problem = problem
+        self._error = np.broadcast_to(values, robot.n).copy()
         self._world = PathWorld(robot, problem.obstacle, problem.object_size)
         world = World(robot, problem.obstacle, problem.object_size)
         self._position_conditions: set[tuple[int, str]] = set()

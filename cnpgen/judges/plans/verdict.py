@@ -72,10 +72,8 @@ class Margin:
         return self.violation / max(self.tolerance, ZERO_TOLERANCE)
 
     def __str__(self) -> str:
-        name, side = (
-            f"{self.name} {self.part}".strip(),
-            "outside" if self.violation > 0 else "within",
-        )
+        name = f"{self.name} {self.part}".strip()
+        side = "outside" if self.violation > 0 else "within"
         distance = f"{abs(self.violation):.3g} {self.unit} {side} {self.bound:.6g}"
         return f"{name}: {distance} (tolerance {self.tolerance:.3g}) at t = {self.time:.4f} s, s = {self.phase:.4f}"
 

@@ -143,7 +143,8 @@ def repeated_fraction(fractions: Array, dtype: str) -> tuple[int, float]:
     drawn = np.sort(fractions[(fractions > 0) & (fractions < 1)])
     # Chance that m of N uniform numbers lie within the tolerance e: about N (N e)^(m-1)
     # / (m-1)!. Find the smallest m that chance does not explain.
-    expected, count = len(drawn) * FRACTION_TOLERANCES[dtype], 2
+    expected = len(drawn) * FRACTION_TOLERANCES[dtype]
+    count = 2
     while (
         len(drawn) * expected ** (count - 1) / math.factorial(count - 1)
         > MIN_PROBABILITY
@@ -185,7 +186,8 @@ def _projected_gradients(
 ) -> Array:
     """Compute the gradient of f in the directions that the constraints leave free [m^2/rad], shape (rows,)."""
     jacobian, gradient = _gradients(robot, q, home, direction)
-    low, high = q - robot.position_lower < at_limit, robot.position_upper - q < at_limit
+    low = q - robot.position_lower < at_limit
+    high = robot.position_upper - q < at_limit
     # Joints at a limit are fixed: without their columns, the multiplier explains the
     # gradient by the rows of J as far as possible.
     free = jacobian * ~(low | high)[:, None]
@@ -209,13 +211,13 @@ def _gradients(
     """
     import pinocchio as pin
 
-    model, tip, frame = (
-        robot.model,
-        robot.tip_frame,
-        pin.ReferenceFrame.LOCAL_WORLD_ALIGNED,
-    )
-    data, zero = model.createData(), np.zeros(robot.n)
-    jacobian, gradient = np.empty((len(q), 3, robot.n)), np.empty((len(q), robot.n))
+    model = robot.model
+    tip = robot.tip_frame
+    frame = pin.ReferenceFrame.LOCAL_WORLD_ALIGNED
+    data = model.createData()
+    zero = np.zeros(robot.n)
+    jacobian = np.empty((len(q), 3, robot.n))
+    gradient = np.empty((len(q), robot.n))
     for row in range(len(q)):
         jacobian[row] = pin.computeFrameJacobian(model, data, q[row], tip, frame)[:3]
         pin.computeForwardKinematicsDerivatives(
@@ -233,21 +235,22 @@ def highest_speed(jacobian: Array, angle: Array, limit: Array) -> Array:
     (rows,). The speed is inf where B has less than two independent columns.
     """
     x, y, z = jacobian.transpose(1, 0, 2)
-    cosine, sine = np.cos(angle)[:, None], np.sin(angle)[:, None]
-    a, b = cosine * x + sine * y, cosine * y - sine * x
+    cosine = np.cos(angle)[:, None]
+    sine = np.sin(angle)[:, None]
+    a = cosine * x + sine * y
+    b = cosine * y - sine * x
     # Vertices of the dual: y solves a_k = (B' y)_k for two joints i and j (Cramer's
     # rule).
     i, j = np.array(list(combinations(range(len(limit)), 2))).T
-    first, second = b[:, i] * z[:, j], z[:, i] * b[:, j]
+    first = b[:, i] * z[:, j]
+    second = z[:, i] * b[:, j]
     # A determinant that is rounding error gives no vertex.
     vertex = np.abs(first - second) > PARALLEL_TOLERANCE * (
         np.abs(first) + np.abs(second)
     )
     scale = 1 / np.where(vertex, first - second, 1.0)
-    u, w = (
-        (a[:, i] * z[:, j] - z[:, i] * a[:, j]) * scale,
-        (b[:, i] * a[:, j] - a[:, i] * b[:, j]) * scale,
-    )
+    u = (a[:, i] * z[:, j] - z[:, i] * a[:, j]) * scale
+    w = (b[:, i] * a[:, j] - a[:, i] * b[:, j]) * scale
     residual = np.abs(
         a[:, :, None] - b[:, :, None] * u[:, None] - z[:, :, None] * w[:, None]
     )

@@ -104,10 +104,8 @@ def compare(
     """
     if violation.size == 0:
         return Check(name, unit, 0.0, 0.0, 0, -1, "start"), np.empty(0, np.int64)
-    tolerance, end = (
-        np.broadcast_to(tolerance, violation.shape),
-        np.broadcast_to(end, violation.shape),
-    )
+    tolerance = np.broadcast_to(tolerance, violation.shape)
+    end = np.broadcast_to(end, violation.shape)
     # A value that cannot be evaluated fails.
     violation = np.where(np.isnan(violation), np.inf, violation)
     failed = np.unique(row[violation > tolerance])
@@ -115,7 +113,8 @@ def compare(
         # A tolerance of zero: any violation is infinitely severe.
         severity = np.where(violation > 0, violation / tolerance, 0.0)
     worst = int(np.argmax(severity))
-    worst_row, worst_end = int(row[worst]), ENDS[int(end[worst])]
+    worst_row = int(row[worst])
+    worst_end = ENDS[int(end[worst])]
     check = Check(
         name,
         unit,

@@ -250,7 +250,8 @@ def _stored_diagnostics(
     problem: Problem, columns: Mapping[str, Array]
 ) -> list[Diagnostic]:
     """List the diagnostics in columns that can be recomputed: torque ratio, and clearance of an arm with a radius."""
-    radius, missing = problem.arm_radius, np.full((len(columns["start_q"]), 1), np.nan)
+    radius = problem.arm_radius
+    missing = np.full((len(columns["start_q"]), 1), np.nan)
     kinds: dict[str, tuple[str, str, Callable[[World], float]]] = {
         "torque_ratio": ("holding torque ratio", "1", _holding_torque_ratio)
     }
@@ -344,7 +345,8 @@ def _judge_position(
 ) -> tuple[Check, Index]:
     claimed = np.stack([columns[f"{end}_xyz"] for end in ENDS], axis=1)
     error = np.linalg.norm(block.position - claimed, axis=2)[finite].ravel()
-    row, end = np.repeat(finite, len(ENDS)), np.tile(np.arange(len(ENDS)), len(finite))
+    row = np.repeat(finite, len(ENDS))
+    end = np.tile(np.arange(len(ENDS)), len(finite))
     tolerance = BOUNDARY_TOLERANCES[dtype]["position"]
     return compare(
         "tip position", "m", violation=error, tolerance=tolerance, row=row, end=end
@@ -429,7 +431,8 @@ def check_plans(
     """
     if "path_control_points" not in columns:
         return PlanCheck()
-    rows, spec = len(columns["start_q"]), problem.trajectory
+    rows = len(columns["start_q"])
+    spec = problem.trajectory
     path = columns["path_control_points"].reshape(
         rows, spec.path_control_points, robot.n
     )

@@ -20,7 +20,8 @@ HULL, BOX, CYLINDER = 0, 1, 2  # kinds in convex.c
 LANES = 8  # vertices and obstacles are padded to a multiple of the widest vector
 BLOCK = 16  # vertices, as in convex.c
 # Fewer vertices are found as fast without blocks; convex.c has memory for 1024 blocks.
-MIN_BLOCKED, MAX_BLOCKED = 49, 1024 * BLOCK
+MIN_BLOCKED = 49
+MAX_BLOCKED = 1024 * BLOCK
 BODY = np.dtype(
     [
         *((name, np.int64) for name in ("kind", "count", "first", "frame", "link")),
@@ -35,7 +36,8 @@ BODY = np.dtype(
     ]
 )
 PADDING_DISTANCE_M = 1e6  # of the bounding boxes that pad the obstacles to full vectors
-_BOX, _CYLINDER = KINDS.index("box"), KINDS.index("cylinder")
+_BOX = KINDS.index("box")
+_CYLINDER = KINDS.index("cylinder")
 
 
 class HullVertices(NamedTuple):
@@ -51,8 +53,10 @@ class HullVertices(NamedTuple):
 
     def put(self, bodies: Bodies, where: Any, first: int) -> None:
         """Enter the hull into the bodies at some indices; ``first`` is the index of its values among all."""
-        bodies["kind"][where], bodies["first"][where] = HULL, first
-        bodies["count"][where], bodies["blocks"][where] = self.vertices, self.blocks
+        bodies["kind"][where] = HULL
+        bodies["first"][where] = first
+        bodies["count"][where] = self.vertices
+        bodies["blocks"][where] = self.blocks
 
 
 def hull_vertices(corners: Array) -> HullVertices:
@@ -84,7 +88,8 @@ def _block_order(corners: Array) -> NDArray[np.int64]:
     The corners are split at a multiple of ``BLOCK`` near the median of the coordinate in
     which they are widest, and so on until one block is left.
     """
-    order, rest = list[NDArray[np.int64]](), [np.arange(len(corners))]
+    order = list[NDArray[np.int64]]()
+    rest = [np.arange(len(corners))]
     while rest:
         part = rest.pop()
         if len(part) == BLOCK:
@@ -116,10 +121,13 @@ def bounding_boxes(bodies: Bodies, centers: Array, half: Array) -> Array:
 
 def primitive_bodies(obstacles: Primitives, first: int) -> tuple[Bodies, Array, Array]:
     """Return the obstacles of N samples as bodies, vertices of meshes and boxes, as ``obstacle_bodies`` of one."""
-    kinds, sizes = obstacles.kinds, obstacles.sizes
+    kinds = obstacles.kinds
+    sizes = obstacles.sizes
     hulls = [hull_vertices(mesh.corners) for mesh in obstacles.meshes]
     ends = np.cumsum([first, *(len(hull.values) for hull in hulls)])
-    box, cylinder, mesh = kinds == _BOX, kinds == _CYLINDER, kinds >= MESH
+    box = kinds == _BOX
+    cylinder = kinds == _CYLINDER
+    mesh = kinds >= MESH
     # Spheres and capsules: a segment along z, of length 0 or 2 h, with a radius around
     # it.
     rounded = (kinds >= 0) & ~(box | cylinder | mesh)
@@ -127,20 +135,14 @@ def primitive_bodies(obstacles: Primitives, first: int) -> tuple[Bodies, Array, 
     bodies["kind"] = np.where(cylinder, CYLINDER, BOX)  # and hulls, below
     # Absent bodies are boxes of size 0 at the padding distance.
     centers = np.where((kinds >= 0)[..., None], obstacles.centers, PADDING_DISTANCE_M)
-    bodies["position"], bodies["rotation"] = (
-        centers,
-        obstacles.rotations.reshape(*kinds.shape, 9),
-    )
+    bodies["position"] = centers
+    bodies["rotation"] = obstacles.rotations.reshape(*kinds.shape, 9)
     for index, hull in enumerate(hulls):
         hull.put(bodies, kinds == MESH + index, int(ends[index]))
-    bodies["size"][box], bodies["size"][cylinder] = (
-        sizes[box],
-        sizes[cylinder][:, [0, 0, 1]],
-    )
-    bodies["size"][rounded, 2], bodies["radius"][rounded] = (
-        sizes[rounded, 1],
-        sizes[rounded, 0],
-    )
+    bodies["size"][box] = sizes[box]
+    bodies["size"][cylinder] = sizes[cylinder][:, [0, 0, 1]]
+    bodies["size"][rounded, 2] = sizes[rounded, 1]
+    bodies["radius"][rounded] = sizes[rounded, 0]
     half = np.where(mesh[..., None], sizes, bodies["size"])
     return (
         bodies,
@@ -167,7 +169,8 @@ def obstacle_bodies(
         bounding boxes by rows (center, half sizes, rotation, radius), shape (16, O
         padded).
     """
-    bodies, vertices = np.zeros(len(obstacles), BODY), list[Array]()
+    bodies = np.zeros(len(obstacles), BODY)
+    vertices = list[Array]()
     centers, halves = np.empty((2, len(obstacles), 3))
     for index, (obstacle, part) in enumerate(
         zip(obstacles, number_slices(obstacles), strict=True)
@@ -188,34 +191,39 @@ def _fill(body: Any, obstacle: Obstacle, numbers: Array) -> tuple[Array, Array]:
 
     Return center and half sizes of its bounding box without radius.
     """
-    rotation, half = np.eye(3), np.zeros(3)
+    rotation = np.eye(3)
+    half = np.zeros(3)
     if obstacle.upright:
         (solid,) = solids_of([obstacle], numbers)
-        center, half = (solid.low + solid.high) / 2, (solid.high - solid.low) / 2
-        body["kind"], body["size"] = BOX, half
+        center = (solid.low + solid.high) / 2
+        half = (solid.high - solid.low) / 2
+        body["kind"] = BOX
+        body["size"] = half
     else:
-        center, rest = numbers[:3], numbers[3:]
+        center = numbers[:3]
+        rest = numbers[3:]
         if obstacle.kind == "box":
-            half, rotation = (
-                rest[:3],
-                rest[3:].reshape(3, 3) if obstacle.is_turned else rotation,
-            )
-            body["kind"], body["size"] = BOX, half
+            half = rest[:3]
+            rotation = rest[3:].reshape(3, 3) if obstacle.is_turned else rotation
+            body["kind"] = BOX
+            body["size"] = half
         elif obstacle.kind == "sphere":
-            body["kind"], body["radius"] = BOX, rest[0]
+            body["kind"] = BOX
+            body["radius"] = rest[0]
         elif obstacle.kind == "mesh":
-            body["kind"], rotation = HULL, rest.reshape(3, 3)
+            body["kind"] = HULL
+            rotation = rest.reshape(3, 3)
             corners = corners_of(obstacle.mesh)
-            low, high = corners.min(axis=0), corners.max(axis=0)
-            body["position"], body["rotation"] = center, rotation.ravel()
+            low = corners.min(axis=0)
+            high = corners.max(axis=0)
+            body["position"] = center
+            body["rotation"] = rotation.ravel()
             # The bounding box of a mesh is that of its corners in the mesh's own frame.
             return center + rotation @ (low + high) / 2, (high - low) / 2
         else:
             length = math.hypot(*rest[:3])
-            rotation, flat = (
-                frame_along(rest[:3].tolist(), length),
-                obstacle.kind == "cylinder",
-            )
+            rotation = frame_along(rest[:3].tolist(), length)
+            flat = obstacle.kind == "cylinder"
             half = (
                 np.array([rest[3], rest[3], length])
                 if flat
@@ -224,5 +232,6 @@ def _fill(body: Any, obstacle: Obstacle, numbers: Array) -> tuple[Array, Array]:
             body["kind"], body["size"], body["radius"] = (
                 (CYLINDER, half, 0.0) if flat else (BOX, half, rest[3])
             )
-    body["position"], body["rotation"] = center, rotation.ravel()
+    body["position"] = center
+    body["rotation"] = rotation.ravel()
     return center, half

@@ -36,7 +36,8 @@ class ClearanceLoss:
             c_void_p,
             c_void_p,
         )
-        self._library, self._checker = library, CollisionChecker(library, robot)
+        self._library = library
+        self._checker = CollisionChecker(library, robot)
 
     def __call__(
         self, q: Array, obstacles: Primitives, required: float
@@ -58,7 +59,8 @@ class ClearanceLoss:
         vertices = np.concatenate([checker.vertices, vertices])
         scene = checker.scene_of(bodies, boxes, vertices)
         states = np.ascontiguousarray(q, np.float64)
-        losses, gradients = np.empty((nodes, samples)), np.empty((nodes, n, samples))
+        losses = np.empty((nodes, samples))
+        gradients = np.empty((nodes, n, samples))
         arrays = address_of(states), required, address_of(losses), address_of(gradients)
         self._library.clearance_losses(ctypes.addressof(scene), samples, nodes, *arrays)
         return losses, gradients

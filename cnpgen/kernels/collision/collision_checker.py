@@ -98,7 +98,8 @@ def load_collision_library(
     """
     library = kernels.load_source(*sources)
     for function in (library.clear_states, library.find_contacts, library.joint_poses):
-        function.restype, function.errcheck = c_long, require_memory
+        function.restype = c_long
+        function.errcheck = require_memory
     library.clear_states.argtypes = (
         c_void_p,
         c_void_p,
@@ -155,7 +156,9 @@ class CollisionChecker:
                 f"distances of hulls need link geometry and at most {MAX_JOINTS} joints"
             )
             raise UsageError(text, concerns="problem")
-        self.library, self._n, self._arrays = library, robot.n, dict[str, Any]()
+        self.library = library
+        self._n = robot.n
+        self._arrays = dict[str, Any]()
         self._scene = _RobotScene()
         self._set_chain(robot)
         parts = self._set_parts(shape)
@@ -163,7 +166,8 @@ class CollisionChecker:
         self._set_pairs(shape, parts, of_link, pair_added or {})
         self._set("moving", np.cumsum(parts["frame"] > 0) - 1)
         self._set("moving_frames", parts["frame"][parts["frame"] > 0])
-        self._scene.n, self._scene.n_parts = robot.n, len(parts)
+        self._scene.n = robot.n
+        self._scene.n_parts = len(parts)
         self.place([], np.empty(0))
 
     def _set_chain(self, robot: Robot) -> None:
@@ -179,13 +183,17 @@ class CollisionChecker:
     def _set_parts(self, shape: Shape) -> Bodies:
         """Store and return the convex parts of the links, with their vertices."""
         links = {capsule.link: i for i, capsule in enumerate(shape.capsules)}
-        parts, blocks, first = np.zeros(len(shape.convex_parts), BODY), list[Array](), 0
+        parts = np.zeros(len(shape.convex_parts), BODY)
+        blocks = list[Array]()
+        first = 0
         for index, part in enumerate(shape.convex_parts):
-            hull, corners = hull_vertices(part.vertices), part.vertices
+            hull = hull_vertices(part.vertices)
+            corners = part.vertices
             hull.put(parts, index, first)
             center = (corners.min(axis=0) + corners.max(axis=0)) / 2
             reach = np.linalg.norm(corners - center, axis=1).max() + part.radius
-            parts["radius"][index], parts["position"][index] = part.radius, center
+            parts["radius"][index] = part.radius
+            parts["position"][index] = center
             parts["bound"][index] = reach * (1 + 1e-12)  # above rounding errors
             parts["frame"][index] = shape.joints[part.link]
             parts["link"][index] = links[part.link]
@@ -260,7 +268,8 @@ class CollisionChecker:
         self._set("obstacles", bodies)
         self._set("boxes", boxes)
         self._set("vertices", np.concatenate([self.vertices, vertices]))
-        self._scene.n_obstacles, self._scene.lanes = len(bodies), boxes.shape[1]
+        self._scene.n_obstacles = len(bodies)
+        self._scene.lanes = boxes.shape[1]
 
     @property
     def address(self) -> int:
@@ -276,7 +285,8 @@ class CollisionChecker:
         scene.obstacles, scene.boxes, scene.vertices = map(
             address_of, (bodies, boxes, vertices)
         )
-        scene.n_obstacles, scene.lanes = bodies.shape[-1], boxes.shape[-1]
+        scene.n_obstacles = bodies.shape[-1]
+        scene.lanes = boxes.shape[-1]
         return scene
 
     def clear_states(
@@ -318,14 +328,14 @@ class CollisionChecker:
                 part by part; else ``link_pairs``.
         """
         # The number of contacts is not known before; C counts all and stores what fits.
-        states, capacity = np.ascontiguousarray(q.T), MIN_CONTACT_CAPACITY
+        states = np.ascontiguousarray(q.T)
+        capacity = MIN_CONTACT_CAPACITY
         while True:
-            pair, k, distance = (
-                np.empty(capacity, np.int64),
-                np.empty(capacity, np.int64),
-                np.empty(capacity),
-            )
-            normal, points = np.empty((capacity, 3)), np.empty((capacity, 2, 3))
+            pair = np.empty(capacity, np.int64)
+            k = np.empty(capacity, np.int64)
+            distance = np.empty(capacity)
+            normal = np.empty((capacity, 3))
+            points = np.empty((capacity, 2, 3))
             addresses = map(address_of, (pair, k, distance, normal, points))
             count = self.library.find_contacts(
                 self.address,

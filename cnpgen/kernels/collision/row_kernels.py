@@ -132,7 +132,8 @@ class _RowKernel(Kernel):
         self, kernels: RowKernels, inner: Kernel, name: str, outputs: tuple[int, ...]
     ) -> None:
         super().__init__(replace(inner.tape, outputs=outputs))
-        self._kernels, self._function = kernels, getattr(kernels._library, name)
+        self._kernels = kernels
+        self._function = getattr(kernels._library, name)
         self._function.restype = None
 
     @property

@@ -129,22 +129,20 @@ def _search(
     """Write the corners of a path into an array; return their number, 0 if there is no path."""
     if manifold is None:
         search = checker.library.find_path
-        search.restype, search.argtypes = c_long, (c_void_p, c_void_p, c_long)
+        search.restype = c_long
+        search.argtypes = (c_void_p, c_void_p, c_long)
         search.errcheck = require_memory
         count = search(ctypes.addressof(native), address_of(path), len(path))
     else:
         # The kernel projects a block of states at once, so the scene is repeated for
         # each lane.
-        search, scene = (
-            checker.library.find_manifold_path,
-            np.repeat(manifold.scene, STATES_PER_PROJECTION),
-        )
-        search.restype, search.argtypes = (
-            c_long,
-            (*(c_void_p,) * 3, c_long, c_double, c_void_p, c_long),
-        )
+        search = checker.library.find_manifold_path
+        scene = np.repeat(manifold.scene, STATES_PER_PROJECTION)
+        search.restype = c_long
+        search.argtypes = (*(c_void_p,) * 3, c_long, c_double, c_void_p, c_long)
         search.errcheck = require_memory
-        residuals, rows = manifold.residuals.address, manifold.residuals.tape.outputs[0]
+        residuals = manifold.residuals.address
+        rows = manifold.residuals.tape.outputs[0]
         errors = rows, MAX_PROJECTION_ERROR
         count = search(
             ctypes.addressof(native),

@@ -66,12 +66,15 @@ class CompiledObservations(ObservationBackend):
 
     def __init__(self, library: ctypes.CDLL) -> None:
         self._library = library
-        pointer, number, flag = c_void_p, c_long, c_int
+        pointer = c_void_p
+        number = c_long
+        flag = c_int
         library.scene_distances.argtypes = (pointer, pointer, number, flag, pointer)
         library.scene_clouds.argtypes = (pointer, pointer, number, pointer)
         library.scene_depths.argtypes = (pointer, pointer, number, number, pointer)
         for function in (library.scene_clouds, library.depth_clouds):
-            function.restype, function.errcheck = number, require_memory
+            function.restype = number
+            function.errcheck = require_memory
         library.depth_clouds.argtypes = (
             number,
             pointer,
@@ -87,7 +90,8 @@ class CompiledObservations(ObservationBackend):
         """See ``ObservationBackend``."""
         coordinates = np.ascontiguousarray(points.swapaxes(-1, -2), np.float32)
         distances = np.empty((len(scenes), points.shape[-2]), np.float32)
-        shared, arrays = points.ndim == 2, ctypes.byref(_SceneArrays(scenes))
+        shared = points.ndim == 2
+        arrays = ctypes.byref(_SceneArrays(scenes))
         addresses = address_of(coordinates), address_of(distances)
         self._library.scene_distances(
             arrays, addresses[0], points.shape[-2], shared, addresses[1]
@@ -96,20 +100,16 @@ class CompiledObservations(ObservationBackend):
 
     def surface_points(self, scenes: Primitives, count: int, seeds: Seeds) -> Values:
         """See ``ObservationBackend``."""
-        points, seeds = (
-            np.empty((len(scenes), count, 3), np.float32),
-            np.ascontiguousarray(seeds),
-        )
+        points = np.empty((len(scenes), count, 3), np.float32)
+        seeds = np.ascontiguousarray(seeds)
         arrays = ctypes.byref(_SceneArrays(scenes))
         self._library.scene_clouds(arrays, address_of(seeds), count, address_of(points))
         return points
 
     def depth_images(self, scenes: Primitives, camera: Camera) -> Values:
         """See ``ObservationBackend``."""
-        depth, view = (
-            np.empty((len(scenes), camera.height, camera.width), np.float32),
-            _view(camera),
-        )
+        depth = np.empty((len(scenes), camera.height, camera.width), np.float32)
+        view = _view(camera)
         arrays = ctypes.byref(_SceneArrays(scenes))
         self._library.scene_depths(
             arrays, address_of(view), camera.width, camera.height, address_of(depth)
@@ -120,11 +120,10 @@ class CompiledObservations(ObservationBackend):
         self, depth: Values, camera: Camera, count: int, seeds: Seeds
     ) -> Values:
         """See ``ObservationBackend``."""
-        points, view = np.empty((len(depth), count, 3), np.float32), _view(camera)
-        depth, seeds = (
-            np.ascontiguousarray(depth, np.float32),
-            np.ascontiguousarray(seeds),
-        )
+        points = np.empty((len(depth), count, 3), np.float32)
+        view = _view(camera)
+        depth = np.ascontiguousarray(depth, np.float32)
+        seeds = np.ascontiguousarray(seeds)
         pointers = (address_of(array) for array in (depth, seeds))
         self._library.depth_clouds(
             len(depth),

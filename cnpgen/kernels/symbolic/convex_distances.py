@@ -41,16 +41,21 @@ def segment_distance(
     #   s = (ab br - ar bb) / (aa bb - ab^2),   t = (ab s + br) / bb.
     # For parallel lines the denominator is 0 and every s minimizes; the floor gives a
     # finite one.
-    a, b = subtract(first[1], first[0]), subtract(second[1], second[0])
+    a = subtract(first[1], first[0])
+    b = subtract(second[1], second[0])
     r = subtract(first[0], second[0])
-    aa, bb, ab = dot(a, a), dot(b, b), dot(a, b)
-    ar, br = dot(a, r), dot(b, r)
+    aa = dot(a, a)
+    bb = dot(b, b)
+    ab = dot(a, b)
+    ar = dot(a, r)
+    br = dot(b, r)
     s = _clamped(
         (ab * br - ar * bb) / ca.fmax(aa * bb - ab * ab, SMOOTHING_M2 * SMOOTHING_M2)
     )
     t = _clamped((ab * s + br) / ca.fmax(bb, SMOOTHING_M2))
     # Clamping t may have moved it, so s is computed again for the t that is used.
-    s, t = freeze(_clamped((ab * t - ar) / ca.fmax(aa, SMOOTHING_M2))), freeze(t)
+    s = freeze(_clamped((ab * t - ar) / ca.fmax(aa, SMOOTHING_M2)))
+    t = freeze(t)
     difference = subtract(add(r, scale(a, s)), scale(b, t))
     # The root of the sum with a small constant has a gradient also at distance 0.
     return ca.sqrt(dot(difference, difference) + SMOOTHING_M2)
@@ -91,10 +96,8 @@ def segment_box_separation(first: Vec, second: Vec, box: Bounds) -> Scalar:
 
     # A missing side becomes a plane 100 m away, so that center and half sizes exist.
     bounds = [_finite(low, high) for low, high in box]
-    center, half = (
-        [(low + high) / 2 for low, high in bounds],
-        [(high - low) / 2 for low, high in bounds],
-    )
+    center = [(low + high) / 2 for low, high in bounds]
+    half = [(high - low) / 2 for low, high in bounds]
     along = [b - a for a, b in zip(first, second, strict=True)]
     # Signed separation along the axes: face normals first, then e_i x along. On the
     # normal n the intervals are |n . offset| and sum(half |n|), both divided by |n|.
@@ -168,12 +171,14 @@ def _overlap_midpoint(first: Vec, along: Vec, box: Bounds) -> Scalar:
     import casadi as ca
 
     # Slab method: the segment is inside between the last entry and the first exit.
-    enter, leave = ca.SX(0), ca.SX(1)
+    enter = ca.SX(0)
+    leave = ca.SX(1)
     for axis, (low, high) in enumerate(box):
         faces = [
             (face - first[axis]) * _inverse(along[axis]) for face in _finite(low, high)
         ]
-        enter, leave = ca.fmax(enter, ca.fmin(*faces)), ca.fmin(leave, ca.fmax(*faces))
+        enter = ca.fmax(enter, ca.fmin(*faces))
+        leave = ca.fmin(leave, ca.fmax(*faces))
     return ca.fmax(ca.fmin(0.5 * (enter + leave), 1), 0)
 
 
@@ -190,17 +195,16 @@ def _closest_parameter(first: Vec, along: Vec, box: Bounds) -> Scalar:
     # The derivative is monotonic in t: the largest knot where it is negative and the
     # smallest one where it is positive bracket the minimum. Between them it is linear,
     # so one secant step gives the root.
-    low, high = ca.SX(0), ca.SX(1)
+    low = ca.SX(0)
+    high = ca.SX(1)
     for knot in knots:
         derivative = _derivative(first, along, box, knot)
         low = ca.fmax(low, ca.if_else(derivative <= 0, knot, 0))
         # ``1 - if_else(..., 1 - knot, 0)`` is the knot, or 1 where the condition does
         # not hold.
         high = ca.fmin(high, 1 - ca.if_else(derivative >= 0, 1 - knot, 0))
-    at_low, at_high = (
-        _derivative(first, along, box, low),
-        _derivative(first, along, box, high),
-    )
+    at_low = _derivative(first, along, box, low)
+    at_high = _derivative(first, along, box, high)
     fraction = ca.fmax(
         ca.fmin(-at_low / ca.fmax(at_high - at_low, MIN_DENOMINATOR), 1), 0
     )

@@ -57,8 +57,10 @@ def motor_torque(
 
 def _upper_friction(drive: Drive, joint: int, v: Scalar, step: Scalar) -> Scalar:
     """Return the upper envelope of the friction of one joint [N m], see ``motor_torque``."""
-    b, c = float(drive.viscous[joint]), float(drive.coulomb[joint])
-    h, w = drive.friction_help, drive.reversal_speed
+    b = float(drive.viscous[joint])
+    c = float(drive.coulomb[joint])
+    h = drive.friction_help
+    w = drive.reversal_speed
     if not (b or c):
         return 0.0
     # b v + c F(v) is certain for the fraction h. F is replaced by 2 S+ - 1, which is

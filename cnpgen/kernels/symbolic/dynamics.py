@@ -123,12 +123,14 @@ def inverse_dynamics(
         )
     # Inward: the joint carries the wrenches of all bodies beyond it. Its torque is the
     # component along its axis.
-    force, torque = [0.0, 0.0, 0.0], [0.0, 0.0, 0.0]
+    force = [0.0, 0.0, 0.0]
+    torque = [0.0, 0.0, 0.0]
     torques: Vec = []
     for joint, motion, wrench in zip(
         chain.joints[::-1], motions[::-1], wrenches[::-1], strict=True
     ):
-        force, torque = add(force, wrench[0]), add(torque, wrench[1])
+        force = add(force, wrench[0])
+        torque = add(torque, wrench[1])
         torques.append(dot(constants(joint.axis), force if joint.prismatic else torque))
         # Into the frame of the previous joint; the lever arm is the offset of the
         # frame.

@@ -53,7 +53,9 @@ def forward_kinematics(chain: Chain, q: Vec) -> Kinematics:
     """Return positions, axes and the tip Jacobian of a chain at joint positions q [rad], n scalars."""
     rotation: list[Vec] = [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]
     position: Vec = [0.0, 0.0, 0.0]
-    axes, origins, frames = [], [], []
+    axes = []
+    origins = []
+    frames = []
     for joint, angle in zip(chain.joints, q, strict=True):
         position = add(position, times(rotation, constants(joint.translation)))
         rotation = product(

@@ -180,7 +180,8 @@ class SymbolicHull(SymbolicBox):
 
         # On one plane the closer end of the segment has the smaller offset. The
         # distance is at least the largest of these offsets over the planes.
-        a, b = self.within(first), self.within(second)
+        a = self.within(first)
+        b = self.within(second)
         best: Scalar = -UNBOUNDED_EXTENT_M
         plane = [0.0] * 4
         for *normal, offset in self.planes:
@@ -203,7 +204,8 @@ class SymbolicHull(SymbolicBox):
         import casadi as ca
 
         best = super().cuboid_separation(center, rotation, size)
-        position, axes = self.within(center), self.axes_within(rotation)
+        position = self.within(center)
+        axes = self.axes_within(rotation)
         for *normal, offset in self.planes:
             # Extent of the cuboid along the plane's normal.
             reach = sum(
@@ -317,7 +319,8 @@ class SymbolicCylinder(SymbolicSolid):
         line = self._line(first, second)
         # Bisection of the sign of the derivative: the number of steps is fixed, since
         # SX has no loops that depend on values.
-        t, width = ca.SX(0.5), 0.5
+        t = ca.SX(0.5)
+        width = 0.5
         for _ in range(BISECTION_STEPS):
             width /= 2
             t = t + ca.if_else(line.derivative(t) < 0, width, -width)
@@ -332,8 +335,10 @@ class SymbolicCylinder(SymbolicSolid):
 
         extent = ca.sqrt(dot(self.half, self.half))
         axis = scale(self.half, 1 / extent)
-        from_center, along = subtract(first, self.center), subtract(second, first)
-        height, axial = dot(from_center, axis), dot(along, axis)
+        from_center = subtract(first, self.center)
+        along = subtract(second, first)
+        height = dot(from_center, axis)
+        axial = dot(along, axis)
         radial = subtract(from_center, scale(axis, height))
         radial_along = subtract(along, scale(axis, axial))
         squares = (
@@ -349,7 +354,8 @@ class SymbolicCylinder(SymbolicSolid):
 
         # In the frame of the cuboid, where its face normals are the coordinate axes.
         position = transposed_times(rotation, subtract(self.center, center))
-        half, edges = transposed_times(rotation, self.half), [edge / 2 for edge in size]
+        half = transposed_times(rotation, self.half)
+        edges = [edge / 2 for edge in size]
         extent = ca.sqrt(dot(half, half))
         axis = scale(half, 1 / extent)
         bounds: Bounds = [(-edge, edge) for edge in edges]
@@ -390,7 +396,8 @@ def _solid(obstacle: Obstacle, values: Vec) -> SymbolicSolid:
     """Return the shape of an obstacle with these values of its pose and size."""
     if obstacle.upright:
         return _upright(obstacle, values[0])
-    position, rest = values[:3], values[3:]
+    position = values[:3]
+    rest = values[3:]
     if obstacle.kind == "box":
         return SymbolicBox(
             [0.0] * 3,
@@ -407,18 +414,18 @@ def _solid(obstacle: Obstacle, values: Vec) -> SymbolicSolid:
     if obstacle.kind == "cylinder":
         return SymbolicCylinder(position, rest[:3], rest[3])
     corners = corners_of(obstacle.mesh)
-    low, high = corners.min(axis=0), corners.max(axis=0)
-    center, half = ((low + high) / 2).tolist(), ((high - low) / 2).tolist()
+    low = corners.min(axis=0)
+    high = corners.max(axis=0)
+    center = ((low + high) / 2).tolist()
+    half = ((high - low) / 2).tolist()
     return SymbolicHull(
         center, half, position, _three_rows(rest), supporting_planes(corners).tolist()
     )
 
 
 def _upright(obstacle: Obstacle, top: Scalar) -> SymbolicUprightBox:
-    height, ranges = (
-        obstacle.height,
-        [bounds for bounds in (obstacle.x, obstacle.y) if bounds is not None],
-    )
+    height = obstacle.height
+    ranges = [bounds for bounds in (obstacle.x, obstacle.y) if bounds is not None]
     sides: Bounds = [(bounds.low, bounds.high) for bounds in ranges]
     return SymbolicUprightBox([*sides, (None if height is None else top - height, top)])
 

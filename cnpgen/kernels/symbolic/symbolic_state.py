@@ -172,14 +172,13 @@ class SymbolicState:
 
     def inverse_dynamics(self, ddq: Vec) -> Vec:
         """Return the torque [N m] of the sample's load at other accelerations [rad/s^2]."""
-        chain, payload, values = (
-            self.robot.chain,
-            self.robot.attached.payload,
-            self.parameters,
-        )
+        chain = self.robot.chain
+        payload = self.robot.attached.payload
+        values = self.parameters
         if payload is None or not self.robot.parameters.changes_payload:
             return inverse_dynamics(chain, self.q, self.dq, ddq)
-        mass, nominal = values.get("payload_mass", payload.mass), list(payload.centre)
+        mass = values.get("payload_mass", payload.mass)
+        nominal = list(payload.centre)
         # The torque is linear in mass, first moment and inertia. If only the mass
         # changes, one multiple of the nominal payload is the difference.
         if values.keys().isdisjoint(PAYLOAD_PARAMETERS[1:]):
@@ -283,16 +282,12 @@ class SymbolicState:
         # Capsules are given in the frames of their joints; those of the base do not
         # move.
         for capsule in shape.capsules:
-            first, second, joint = (
-                constants(capsule.first),
-                constants(capsule.second),
-                shape.joints[capsule.link],
-            )
+            first = constants(capsule.first)
+            second = constants(capsule.second)
+            joint = shape.joints[capsule.link]
             if joint > 0:
-                rotation, origin = (
-                    self.kinematics.frames[joint - 1],
-                    self.kinematics.origins[joint - 1],
-                )
+                rotation = self.kinematics.frames[joint - 1]
+                origin = self.kinematics.origins[joint - 1]
                 first, second = (
                     add(origin, times(rotation, end)) for end in (first, second)
                 )
@@ -329,10 +324,8 @@ class FrozenState(SymbolicState):
         """Replace the symbols of frozen values by the values."""
         import casadi as ca
 
-        symbols, values = (
-            [symbol for symbol, _ in self.frozen],
-            [value for _, value in self.frozen],
-        )
+        symbols = [symbol for symbol, _ in self.frozen]
+        values = [value for _, value in self.frozen]
         substituted: list[Any] = (
             ca.substitute(results, symbols, values) if symbols else results
         )
@@ -352,7 +345,8 @@ def time_derivatives(
     ddq = [b * r * r + a * r * r1 for a, b in zip(p1, p2, strict=True)]
     if len(path) < 3:
         return dq, ddq, None
-    r2, terms = rate[2], zip(p1, p2, path[2], strict=True)
+    r2 = rate[2]
+    terms = zip(p1, p2, path[2], strict=True)
     return (
         dq,
         ddq,

@@ -55,8 +55,10 @@ class BatchScenes:
     @cached_property
     def bodies(self) -> tuple[Bodies, Array]:
         """Bodies, shape (S, O), and bounding boxes, shape (S, 16, O padded), as of ``obstacle_bodies``."""
-        table, rotation = self.table, rotations_of(self.table).reshape(len(self), -1, 9)
-        kind, size = table.obstacle_kind, table.obstacle_size.astype(np.float64)
+        table = self.table
+        rotation = rotations_of(self.table).reshape(len(self), -1, 9)
+        kind = table.obstacle_kind
+        size = table.obstacle_size.astype(np.float64)
         box, cylinder = (
             kind == OBSTACLE_KINDS.index(name) for name in ("box", "cylinder")
         )
@@ -69,9 +71,11 @@ class BatchScenes:
             ..., None
         ]
         bodies = np.zeros(kind.shape, BODY)
-        bodies["kind"], bodies["size"] = np.where(cylinder, CYLINDER, BOX), half
+        bodies["kind"] = np.where(cylinder, CYLINDER, BOX)
+        bodies["size"] = half
         bodies["radius"] = np.where(box | cylinder, 0.0, size[..., 0])
-        bodies["rotation"], bodies["position"] = rotation, table.obstacle_position
+        bodies["rotation"] = rotation
+        bodies["position"] = table.obstacle_position
         return bodies, bounding_boxes(bodies, bodies["position"], half)
 
 

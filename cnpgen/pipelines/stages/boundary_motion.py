@@ -100,10 +100,8 @@ class AtRest(Stage):
 
     def complete(self, context: Context, given: Collection[str]) -> StageFunction:
         """Reject tasks with a non-zero given velocity or acceleration."""
-        rest, names = (
-            self.prepare(context),
-            [name for name in self.writes(context) if name in given],
-        )
+        rest = self.prepare(context)
+        names = [name for name in self.writes(context) if name in given]
 
         def work(candidates: CandidateBatch, random: np.random.Generator) -> None:
             for name in names:
@@ -137,15 +135,14 @@ class TableVelocity(Stage):
 
     def prepare(self, context: Context) -> StageFunction:
         context.constraint(Table)
-        kernel, n = context.kernels.load(table_velocity), context.robot.n
+        kernel = context.kernels.load(table_velocity)
+        n = context.robot.n
 
         def work(candidates: CandidateBatch, random: np.random.Generator) -> None:
             # Numbers are drawn for all candidates, whatever earlier stages rejected.
-            direction, length, choice = (
-                2 * candidates.draw(random, n) - 1,
-                candidates.draw(random, 1),
-                candidates.draw(random, 1),
-            )
+            direction = 2 * candidates.draw(random, n) - 1
+            length = candidates.draw(random, 1)
+            choice = candidates.draw(random, 1)
             length[choice < self.at_rest] = 0.0
             candidates["start_dq"], candidates["start_tip_velocity"] = kernel(
                 candidates["start_q"], direction, length
@@ -162,7 +159,8 @@ class TableVelocity(Stage):
 
         A start without a given velocity is at rest.
         """
-        kernel, n = context.kernels.load(velocity_of_tip), context.robot.n
+        kernel = context.kernels.load(velocity_of_tip)
+        n = context.robot.n
 
         def work(candidates: CandidateBatch, _random: np.random.Generator) -> None:
             if "start_dq" not in given:
@@ -197,13 +195,12 @@ class TableAcceleration(Stage):
 
     def prepare(self, context: Context) -> StageFunction:
         context.constraint(Table)
-        kernel, n = context.kernels.load(table_acceleration), context.robot.n
+        kernel = context.kernels.load(table_acceleration)
+        n = context.robot.n
 
         def work(candidates: CandidateBatch, random: np.random.Generator) -> None:
-            direction, length = (
-                2 * candidates.draw(random, n) - 1,
-                candidates.draw(random, 1),
-            )
+            direction = 2 * candidates.draw(random, n) - 1
+            length = candidates.draw(random, 1)
             acceleration, interval_length = kernel(
                 candidates[f"{self.end}_q"],
                 candidates[f"{self.end}_dq"],
@@ -404,11 +401,14 @@ def _interval(
     """Return the interval of t with ``|at_zero + t gradient| <= bounds`` in every component."""
     import casadi as ca
 
-    low, high = ca.SX(-1e9), ca.SX(1e9)
+    low = ca.SX(-1e9)
+    high = ca.SX(1e9)
     for value, rate, bound in zip(at_zero, gradient, bounds, strict=True):
         # 1 / 0 is infinite: a component that does not change bounds t only if it is
         # violated, and then the interval is empty.
         inverse = 1.0 / rate
-        one, two = (bound - value) * inverse, (-bound - value) * inverse
-        low, high = ca.fmax(low, ca.fmin(one, two)), ca.fmin(high, ca.fmax(one, two))
+        one = (bound - value) * inverse
+        two = (-bound - value) * inverse
+        low = ca.fmax(low, ca.fmin(one, two))
+        high = ca.fmin(high, ca.fmax(one, two))
     return low, high

@@ -107,10 +107,8 @@ class Collision(Stage):
 
         def work(candidates: CandidateBatch, _random: np.random.Generator) -> None:
             for end in self._ends():
-                q, obstacle_poses = (
-                    candidates[f"{end}_q"],
-                    candidate_poses(context.problem, candidates),
-                )
+                q = candidates[f"{end}_q"]
+                obstacle_poses = candidate_poses(context.problem, candidates)
                 remaining = np.ones(q.shape[1], bool)
                 if not with_object:
                     (clearance,) = kernel(q, obstacle_poses)
@@ -160,7 +158,8 @@ def _contact_depth(context: Context) -> float:
 
 def candidate_poses(problem: Problem, candidates: CandidateBatch) -> Array:
     """Return the scene of every candidate, shape (width, n): poses of the obstacles, and the puck of a hit."""
-    goal, angle = candidates["goal_xyz"].T, candidates.columns.get("hit_angle")
+    goal = candidates["goal_xyz"].T
+    angle = candidates.columns.get("hit_angle")
     direction = np.zeros(goal.shape)
     if angle is not None:
         # Columns that are not finite are rejected.
@@ -277,7 +276,8 @@ def _add_obstacles(
     import pinocchio as pin
 
     # Heights are the positions of sliding joints, so one model serves all candidates.
-    poses, heights = place_obstacles(problem.obstacle), height_places(problem.obstacle)
+    poses = place_obstacles(problem.obstacle)
+    heights = height_places(problem.obstacle)
     poses[heights] = 0.0
     solids = solids_of(problem.obstacle, poses)
     for index, (obstacle, solid) in enumerate(
@@ -315,7 +315,8 @@ def _add_convex_parts(geometry: Any, shape: Shape, distance: float) -> list[int]
 
     added: list[int] = []
     for part in shape.moving_convex_parts:
-        hull, name = coal_hull(part.vertices), f"{part.link}_{len(added)}"
+        hull = coal_hull(part.vertices)
+        name = f"{part.link}_{len(added)}"
         # A body inflated by the distance collides exactly if the distance is not kept.
         hull.setSweptSphereRadius(part.radius + distance)
         solid = pin.GeometryObject(
@@ -345,10 +346,8 @@ def _add_capsules(geometry: Any, robot: Robot, radius: float) -> list[int]:
         # The body that carries origin b; the joints between a and b lie on the
         # segment's line.
         joint = b
-        first, second = (
-            data.oMi[joint].actInv(origins[a]),
-            data.oMi[joint].actInv(origins[b]),
-        )
+        first = data.oMi[joint].actInv(origins[a])
+        second = data.oMi[joint].actInv(origins[b])
         length = float(np.linalg.norm(second - first))
         turn = pin.Quaternion.FromTwoVectors(
             np.array([0.0, 0.0, 1.0]), (second - first) / length

@@ -65,7 +65,8 @@ class DrawScenes(Stage):
 
     def prepare(self, context: Context) -> StageFunction:
         self._check(context)
-        obstacles, shares = context.problem.obstacle, self._shares()
+        obstacles = context.problem.obstacle
+        shares = self._shares()
         capacity = sum(self.capacity.values())
 
         def work(candidates: CandidateBatch, random: np.random.Generator) -> None:
@@ -120,7 +121,8 @@ class DrawScenes(Stage):
 
     def _check(self, context: Context) -> None:
         """Raise RecipeError if the problem cannot have these scenes."""
-        problem, errors = context.problem, list[str]()
+        problem = context.problem
+        errors = list[str]()
         places = {
             kind: len(parked)
             for kind, parked in sample_obstacles(problem.obstacle).items()
@@ -166,9 +168,12 @@ def base_depths(table: SceneTable) -> NDArray[np.float64]:
             "soji,soj->soi", rotations_of(table), -table.obstacle_position.astype(float)
         )
     )
-    size, kind = table.obstacle_size.astype(float), table.obstacle_kind
-    across, up = np.hypot(local[..., 0], local[..., 1]), local[..., 2]
-    radius, half = size[..., 0], size[..., 1] / 2
+    size = table.obstacle_size.astype(float)
+    kind = table.obstacle_kind
+    across = np.hypot(local[..., 0], local[..., 1])
+    up = local[..., 2]
+    radius = size[..., 0]
+    half = size[..., 1] / 2
     # Depth of a point: box, sphere, cylinder, capsule, in the order of
     # ``OBSTACLE_KINDS``.
     depths = [

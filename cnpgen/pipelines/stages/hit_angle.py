@@ -24,7 +24,8 @@ class _HitAngle(Stage):
     """Base class: hit direction on the table."""
 
     def outputs(self, context: Context) -> tuple[Field, ...]:
-        low, high = (-float(np.pi),), (float(np.pi),)
+        low = (-float(np.pi),)
+        high = (float(np.pi),)
         text = "direction of the hit about world z, from world x"
         return (
             Field(
@@ -121,10 +122,8 @@ class BehindPuck(Stage):
 
     def outputs(self, context: Context) -> tuple[Field, ...]:
         table = context.constraint(Table)
-        low, high = (
-            (table.x.low, table.y.low, table.z),
-            (table.x.high, table.y.high, table.z),
-        )
+        low = (table.x.low, table.y.low, table.z)
+        high = (table.x.high, table.y.high, table.z)
         return (position_field("goal", low, high),)
 
     def prepare(self, context: Context) -> StageFunction:

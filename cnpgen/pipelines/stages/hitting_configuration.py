@@ -170,7 +170,8 @@ class _Search:
         )
         (reached,) = self._value(held, direction, home)
         better = found & (reached[0] > value[some])
-        q[:, some[better]], value[some[better]] = held[:, better], reached[0, better]
+        q[:, some[better]] = held[:, better]
+        value[some[better]] = reached[0, better]
 
 
 def better_optimum(robot: Robot) -> Any:
@@ -207,10 +208,8 @@ def better_optimum(robot: Robot) -> Any:
     )
     found: list[Any] = []
     for one, two in (inside, outside):
-        first, second = (
-            ca.if_else(one, value1[0], -np.inf),
-            ca.if_else(two, value2[0], -np.inf),
-        )
+        first = ca.if_else(one, value1[0], -np.inf)
+        second = ca.if_else(two, value2[0], -np.inf)
         found.append(
             ca.vertcat(
                 *[ca.if_else(second > first, b, a) for a, b in zip(q1, q2, strict=True)]
@@ -243,7 +242,8 @@ def within_limits(
     further arguments of the kernel. Return configurations and the mask of optima, shape
     (N,).
     """
-    low, high = robot.position_lower[:, None], robot.position_upper[:, None]
+    low = robot.position_lower[:, None]
+    high = robot.position_upper[:, None]
     # Sign of the limit on which a joint is held, else 0.
     side = np.where(q > high, 1.0, np.where(q < low, -1.0, 0.0))
     q, left = np.clip(q, low, high), np.arange(q.shape[1])

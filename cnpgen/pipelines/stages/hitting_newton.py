@@ -109,7 +109,8 @@ class Expansion:
 
     def hessian(self, multiplier: Vec) -> list[list[Scalar]]:
         """Hessian of ``f - multiplier . FK``, full symmetric n x n."""
-        kin, gain_gradient = self.kin, self.gain_gradient
+        kin = self.kin
+        gain_gradient = self.gain_gradient
         axis_rates, column_rates = _rates(kin, self.gain)
         across = [cross(self.direction, axis) for axis in kin.axes]
         across_rate = [cross(self.direction, rate) for rate in axis_rates]
@@ -162,7 +163,8 @@ def _rates(kin: Kinematics, rate: Vec) -> tuple[list[Vec], list[Vec]]:
     # before it, and dz/dt = omega x z, dJ/dt = dz/dt x (tip - o) + z x (d tip - d o).
     # Velocities of the tip and of the joint origins if the joints move at the rates.
     tip_rate = [dot([column[row] for column in kin.jacobian], rate) for row in range(3)]
-    axis_rates, column_rates = [], []
+    axis_rates = []
+    column_rates = []
     for axis, origin, speed in zip(kin.axes, kin.origins, rate, strict=True):
         origin_rate = add(origin_rate, cross(turning, subtract(origin, previous)))
         previous = origin
@@ -215,7 +217,8 @@ def _reduced_step(here: Expansion, miss: Vec, basic: tuple[int, int, int]) -> Ve
     """Return the Newton step: basic joints correct the position, free joints follow the reduced Newton direction."""
     import casadi as ca
 
-    n, jacobian = here.n, here.kin.jacobian
+    n = here.n
+    jacobian = here.kin.jacobian
     # Basic joints B solve the constraint: J_B s_B = miss - J_F s_F.
     inverse = inverse3([jacobian[j] for j in basic])
     # Multiplier of the constraint from the basic joints: J_B^T lambda = g_B.
@@ -334,11 +337,10 @@ def basic_joints(robot: Robot) -> tuple[int, int, int]:
     import pinocchio as pin
 
     random = np.random.default_rng(0)
-    low, high = (
-        np.maximum(robot.home - 0.7, robot.position_lower),
-        np.minimum(robot.home + 0.7, robot.position_upper),
-    )
-    data, tip = robot.model.createData(), robot.tip_frame
+    low = np.maximum(robot.home - 0.7, robot.position_lower)
+    high = np.minimum(robot.home + 0.7, robot.position_upper)
+    data = robot.model.createData()
+    tip = robot.tip_frame
     frame = pin.ReferenceFrame.LOCAL_WORLD_ALIGNED
     jacobians = np.array(
         [

@@ -86,7 +86,8 @@ class HittingVelocity(Stage):
         def draw_share(
             candidates: CandidateBatch, random: np.random.Generator, _speed: Array
         ) -> Array:
-            factor, choice = candidates.draw(random, 1), candidates.draw(random, 1)
+            factor = candidates.draw(random, 1)
+            choice = candidates.draw(random, 1)
             # Both numbers are drawn for every candidate, so that the fraction does not
             # change later ones.
             return np.where(choice < self.full_speed, 1.0, factor)
@@ -152,17 +153,12 @@ class HittingVelocity(Stage):
             limit = velocity_factor(context, candidates)
             if limit is not None:
                 # The optimum of the linear program scales with its bounds.
-                velocity, speed = velocity * limit, speed * limit
+                velocity = velocity * limit
+                speed = speed * limit
             factor = share(candidates, random, speed)
-            (
-                candidates["goal_dq"],
-                candidates["hit_speed"],
-                candidates["hit_speed_max"],
-            ) = (
-                velocity * factor,
-                speed * factor,
-                speed,
-            )
+            candidates["goal_dq"] = velocity * factor
+            candidates["hit_speed"] = speed * factor
+            candidates["hit_speed_max"] = speed
             candidates.reject(found[0] > 0, "no hitting velocity")
 
         return work

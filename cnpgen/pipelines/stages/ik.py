@@ -108,10 +108,8 @@ class GuessedIK(Stage):
         kernel = context.kernels.load(
             ik_step, Loop(IK_TOLERANCE, MAX_IK_STEPS), **options
         )
-        low, high = (
-            context.robot.position_lower[:, None],
-            context.robot.position_upper[:, None],
-        )
+        low = context.robot.position_lower[:, None]
+        high = context.robot.position_upper[:, None]
 
         def work(candidates: CandidateBatch, _random: np.random.Generator) -> None:
             more = [candidates["held"]] if hold else []
@@ -135,7 +133,8 @@ class GuessedIK(Stage):
         return work
 
     def _solve_guessed(self, context: Context, end: str) -> StageFunction:
-        guess, solve = self._guesses(context), self._solve(context, end)
+        guess = self._guesses(context)
+        solve = self._solve(context, end)
 
         def work(candidates: CandidateBatch, random: np.random.Generator) -> None:
             guess(candidates, random)
@@ -145,7 +144,8 @@ class GuessedIK(Stage):
 
     def _guesses(self, context: Context) -> StageFunction:
         """Return the stage function that draws initial guesses."""
-        robot, n = context.robot, context.robot.n
+        robot = context.robot
+        n = context.robot.n
         if self.guess and len(self.guess) != n:
             raise RecipeError(
                 [
@@ -245,7 +245,8 @@ class GoalIK(GuessedIK):
         )
 
     def prepare(self, context: Context) -> StageFunction:
-        search, max_change = self._search(context), self.max_change
+        search = self._search(context)
+        max_change = self.max_change
         if max_change is None:
             return search
 
@@ -261,7 +262,8 @@ class GoalIK(GuessedIK):
     def _search(self, context: Context) -> StageFunction:
         if not self.guess:
             return self._solve(context, "goal", "start_q")
-        guess, solve = self._guesses(context), self._solve(context, "goal")
+        guess = self._guesses(context)
+        solve = self._solve(context, "goal")
 
         def work(candidates: CandidateBatch, random: np.random.Generator) -> None:
             guess(candidates, random)
@@ -311,7 +313,8 @@ def ik_step(
         tilt, tilt_rows = _tilt(
             kin, [axes[:3], axes[3:6], axes[6:]] if turned else None
         )
-        error, rows = [*error, *tilt], [*rows, *tilt_rows]
+        error = [*error, *tilt]
+        rows = [*rows, *tilt_rows]
     if hold:
         # Columns of held joints are zero, so they do not move.
         rows = [
@@ -368,7 +371,8 @@ def _tilt(kin: Kinematics, frame: list[Vec] | None) -> tuple[Vec, list[Vec]]:
     import casadi as ca
 
     # Angular velocity about the axes of the frame: components of the joint axes.
-    up, turns_about = [row[2] for row in kin.rotation], kin.axes
+    up = [row[2] for row in kin.rotation]
+    turns_about = kin.axes
     if frame is not None:
         up = [dot(axis, up) for axis in frame]
         turns_about = [[dot(axis, turning) for axis in frame] for turning in kin.axes]
@@ -447,10 +451,8 @@ class Home(GuessedIK):
 
     def prepare(self, context: Context) -> StageFunction:
         check_reach(context, (("position", self.position),))
-        guess_home, tip = (
-            self._solve_guessed(context, "home"),
-            context.kernels.load(tip_position),
-        )
+        guess_home = self._solve_guessed(context, "home")
+        tip = context.kernels.load(tip_position)
         base = context.robot.home[:, None]
 
         def work(candidates: CandidateBatch, random: np.random.Generator) -> None:
@@ -459,7 +461,8 @@ class Home(GuessedIK):
             # not change.
             candidates["home_choice"] = candidates.draw(random, 1)
             guess_home(candidates, random)
-            choice, elsewhere = candidates["home_choice"][0], candidates["home_q"]
+            choice = candidates["home_choice"][0]
+            elsewhere = candidates["home_q"]
             # Nested choice: start, else base, else the solution for a random position.
             home = np.where(choice < self.at_start + self.at_base, base, elsewhere)
             candidates["home_q"] = np.where(

@@ -92,10 +92,8 @@ class BallisticReach(Stage):
         return self._require(context, "is off the table, or leaves it")
 
     def _require(self, context: Context, reason: str) -> StageFunction:
-        table, varies = (
-            context.constraint(Table),
-            context.problem.parameters.changes_rectangle,
-        )
+        table = context.constraint(Table)
+        varies = context.problem.parameters.changes_rectangle
         sides = [[side.low, side.high] for side in (table.x, table.y)]
         over = context.kernels.load(over_table, sides=None if varies else sides)
 
@@ -109,7 +107,8 @@ class BallisticReach(Stage):
                 candidates.reject(ahead[0] > 0, f"the start {reason}")
             if self.goal_time:
                 goal = on_table(context, candidates, candidates["goal_xyz"])[:2]
-                angle, speed = candidates["hit_angle"], candidates["hit_speed"]
+                angle = candidates["hit_angle"]
+                speed = candidates["hit_speed"]
                 velocity = np.concatenate(
                     [speed * np.cos(angle), speed * np.sin(angle)]
                 )
@@ -143,7 +142,8 @@ def over_table(*, sides: list[list[float]] | None) -> Any:
         ]
         return ca.logic_and(*inside)
 
-    ahead, behind = is_over(add(p, d)), is_over(subtract(p, d))
+    ahead = is_over(add(p, d))
+    behind = is_over(subtract(p, d))
     return ca.Function("over_table", given, [ahead, ca.logic_and(ahead, behind)])
 
 
@@ -217,9 +217,11 @@ def overshoot(
         return worst
     for which in np.flatnonzero(suspects.any(axis=1)):
         suspect = np.flatnonzero(suspects[which])
-        side, edge = EDGE_SIDES[which, 0], edges[which, 0]
+        side = EDGE_SIDES[which, 0]
+        edge = edges[which, 0]
         normal = np.zeros((3, len(suspect)))
-        normal[which // 2], normal[2] = side, side * edge
+        normal[which // 2] = side
+        normal[2] = side * edge
         unknown = np.full((1, len(suspect)), -1.0)
         states = np.take(q, suspect, 1), np.take(dq, suspect, 1), unknown
         final, running = brake(np.concatenate(states), normal)
@@ -305,7 +307,8 @@ def _acceleration_box(robot: Robot, dq: Vec) -> tuple[Vec, Vec]:
     """Return bounds of the accelerations that keep the velocity within its limits over the step."""
     import casadi as ca
 
-    low, high = [], []
+    low = []
+    high = []
     for rate, most, fastest in zip(
         dq, robot.acceleration_limit, robot.velocity_limit, strict=True
     ):

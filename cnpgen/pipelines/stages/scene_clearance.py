@@ -43,15 +43,14 @@ class _SceneChecker(CollisionChecker):
         """Build the arrays of all scenes of a batch, for ``place_scene``."""
         fixed, (bodies, boxes) = len(self._fixed), scenes.bodies
         together = np.zeros((len(scenes), fixed + bodies.shape[1]), bodies.dtype)
-        together[:, :fixed], together[:, fixed:] = self._fixed, bodies
+        together[:, :fixed] = self._fixed
+        together[:, fixed:] = bodies
         self._counts = (fixed + scenes.table.obstacle_count).tolist()
         self._boxes = []
         for box, count in zip(boxes, self._counts, strict=True):
             padded = np.zeros((16, count + -count % LANES))
-            padded[:, :fixed], padded[:, fixed:count] = (
-                self._fixed_boxes,
-                box[:, : count - fixed],
-            )
+            padded[:, :fixed] = self._fixed_boxes
+            padded[:, fixed:count] = box[:, : count - fixed]
             # Padding is too far away to be near any capsule.
             padded[:3, count:] = PADDING_DISTANCE_M
             self._boxes.append(padded)
@@ -59,10 +58,8 @@ class _SceneChecker(CollisionChecker):
             (address_of(box) if box.size else None, box.shape[1]) for box in self._boxes
         ]
         self._set("obstacles", together)
-        self._first, self._stride = (
-            address_of(self._arrays["obstacles"]),
-            together.strides[0],
-        )
+        self._first = address_of(self._arrays["obstacles"])
+        self._stride = together.strides[0]
 
     def clear_of_scenes(
         self, q: Array, runs: list[tuple[int, int, int]], limits: tuple[float, float]
@@ -72,20 +69,19 @@ class _SceneChecker(CollisionChecker):
         Runs are scene, first state and end of states in one scene; limits are required
         distances from obstacles and of links from each other [m], -inf for no check.
         """
-        states, clear = np.ascontiguousarray(q.T), np.empty(q.shape[1], np.uint8)
-        native, check, address = self._scene, self.library.clear_states, self.address
-        first_state, first_flag, stride = (
-            address_of(states),
-            address_of(clear),
-            states.strides[0],
-        )
+        states = np.ascontiguousarray(q.T)
+        clear = np.empty(q.shape[1], np.uint8)
+        native = self._scene
+        check = self.library.clear_states
+        address = self.address
+        first_state = address_of(states)
+        first_flag = address_of(clear)
+        stride = states.strides[0]
         # Only pointers change from scene to scene; the arrays of all scenes were built
         # at once.
         for scene, first, end in runs:
-            native.obstacles, native.n_obstacles = (
-                self._first + scene * self._stride,
-                self._counts[scene],
-            )
+            native.obstacles = self._first + scene * self._stride
+            native.n_obstacles = self._counts[scene]
             native.boxes, native.lanes = self._places[scene]
             place = first_state + first * stride
             check(address, place, end - first, *limits, first_flag + first)

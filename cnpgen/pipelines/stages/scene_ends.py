@@ -93,14 +93,10 @@ class SceneEnds(Stage):
         )
 
     def outputs(self, context: Context) -> tuple[Field, ...]:
-        center, reach = (
-            context.robot.chain.joints[0].translation,
-            context.robot.chain.reach,
-        )
-        low, high = (
-            (np.asarray(center) - reach).tolist(),
-            (np.asarray(center) + reach).tolist(),
-        )
+        center = context.robot.chain.joints[0].translation
+        reach = context.robot.chain.reach
+        low = (np.asarray(center) - reach).tolist()
+        high = (np.asarray(center) + reach).tolist()
         return (
             context.joint_field("start_q", "rad", "joint positions at the start"),
             context.joint_field(
@@ -117,7 +113,8 @@ class SceneEnds(Stage):
         return leave
 
     def prepare(self, context: Context) -> StageFunction:
-        states, tip = _EndStates(context, self), context.kernels.load(tip_position)
+        states = _EndStates(context, self)
+        tip = context.kernels.load(tip_position)
 
         def work(candidates: CandidateBatch, random: np.random.Generator) -> None:
             scenes = candidates.scenes
@@ -133,7 +130,8 @@ class SceneEnds(Stage):
                 random, 1 + NUMBERS_PER_PAIR * MAX_PAIRS_PER_CANDIDATE
             )
             start, goal = states.pairs(scenes, pools, candidates.scene, numbers)
-            candidates["start_q"], candidates["goal_q"] = start, goal
+            candidates["start_q"] = start
+            candidates["goal_q"] = goal
             candidates.reject(np.isfinite(start).all(axis=0), NO_ENDS)
             for end in ("start", "goal"):
                 (candidates[f"{end}_xyz"],) = tip(candidates[f"{end}_q"])
@@ -193,7 +191,8 @@ class _EndStates:
 
     def __init__(self, context: Context, stage: SceneEnds) -> None:
         self._robot: Robot = context.robot
-        self._stage, self._clearance = stage, SceneClearance(context)
+        self._stage = stage
+        self._clearance = SceneClearance(context)
         loop = Loop(POSE_TOLERANCE, MAX_POSE_IK_STEPS)
         self._ik: Kernel = context.kernels.load(pose_ik_step, loop)
         self._torque: Kernel = context.kernels.load(torque_ratio)
@@ -202,8 +201,10 @@ class _EndStates:
         self, scenes: BatchScenes, random: np.random.Generator
     ) -> dict[str, _Pool]:
         """Draw states of all scenes and keep the valid ones."""
-        robot, count = self._robot, len(scenes)
-        low, high = robot.position_lower[:, None], robot.position_upper[:, None]
+        robot = self._robot
+        count = len(scenes)
+        low = robot.position_lower[:, None]
+        high = robot.position_upper[:, None]
         # All random numbers of a batch are drawn before any check, in a fixed order.
         neutral = robot.home[:, None] + self._stage.spread * random.standard_normal(
             (robot.n, count * NEUTRAL_STATES)
@@ -259,7 +260,9 @@ class _EndStates:
 
         Return joint positions and keys of the solved ones.
         """
-        stage, robot, count = self._stage, self._robot, len(scenes)
+        stage = self._stage
+        robot = self._robot
+        count = len(scenes)
         # Random order of the grasps of each scene; padding sorts last.
         order = random.random((count, scenes.grasp_tilt.shape[1]))
         order[np.arange(order.shape[1]) >= scenes.grasp_count[:, None]] = np.inf
@@ -280,7 +283,8 @@ class _EndStates:
         )
         # Poses within the tilt of the approach, uniform on the spherical cap.
         rotation = _rotations(approach, tilt, u[:3])
-        low, high = robot.position_lower[:, None], robot.position_upper[:, None]
+        low = robot.position_lower[:, None]
+        high = robot.position_upper[:, None]
         lanes = [
             np.ascontiguousarray(each)
             for each in (low + (high - low) * u[3:], position.T, rotation)
@@ -299,11 +303,14 @@ class _EndStates:
         numbers: Array,
     ) -> tuple[Array, Array]:
         """Return starts and goals of the candidates [rad], nan without one, shape (n, N) each."""
-        stage, size = self._stage, (self._robot.n, len(scene))
-        start, goal = np.full(size, np.nan), np.full(size, np.nan)
+        stage = self._stage
+        size = (self._robot.n, len(scene))
+        start = np.full(size, np.nan)
+        goal = np.full(size, np.nan)
         # A share of the samples may have a free straight line; the others must need a
         # detour.
-        may_be_straight, pending = numbers[0] < stage.straight, np.arange(len(scene))
+        may_be_straight = numbers[0] < stage.straight
+        pending = np.arange(len(scene))
         used = np.empty(0, np.int64)
         for attempt in range(MAX_PAIRS_PER_CANDIDATE):
             first = 1 + NUMBERS_PER_PAIR * attempt
@@ -321,10 +328,8 @@ class _EndStates:
                 scenes, q[:, lines], aim[:, lines], scene[pending[lines]]
             )
             used = np.append(used, key[accepted])
-            start[:, pending[accepted]], goal[:, pending[accepted]] = (
-                q[:, accepted],
-                aim[:, accepted],
-            )
+            start[:, pending[accepted]] = q[:, accepted]
+            goal[:, pending[accepted]] = aim[:, accepted]
             pending = pending[~accepted]
             if not len(pending):
                 break
@@ -394,7 +399,9 @@ def _rotations(approach: Array, tilt: Array, u: Array) -> Array:
     """
     # Uniform on a cap: the cosine is uniform between cos(tilt) and 1 (Archimedes).
     cosine = 1 - u[0] * (1 - np.cos(tilt))
-    sine, angle, roll = np.sqrt(1 - cosine**2), 2 * np.pi * u[1], 2 * np.pi * u[2]
+    sine = np.sqrt(1 - cosine**2)
+    angle = 2 * np.pi * u[1]
+    roll = 2 * np.pi * u[2]
     first, second = _across(approach)
     z = (
         (sine * np.cos(angle))[:, None] * first

@@ -123,7 +123,8 @@ class CandidateBatch:
     """
 
     def __init__(self, size: int, *, last: bool = False) -> None:
-        self.size, self.last = size, last
+        self.size = size
+        self.last = last
         self.alive = np.arange(size)
         self.outcome = np.zeros(size, np.uint16)
         self.reasons: list[str] = []
@@ -285,10 +286,8 @@ class Stage(ABC):
             UsageError: Some but not all task inputs of the stage are given.
         """
         names = [field.name for field in self.task_inputs(context)]
-        known, missing = (
-            [name for name in names if name in given],
-            [name for name in names if name not in given],
-        )
+        known = [name for name in names if name in given]
+        missing = [name for name in names if name not in given]
         if known and missing:
             raise UsageError(
                 f"{', '.join(known)}: tasks that give this must also give {', '.join(missing)}"

@@ -233,7 +233,8 @@ class Axis(TipAxis):
             return super()._held(pointing, parameters)
         # d . R a >= cos(angle): the cosine is linear in R, the angle is not smooth at
         # zero.
-        cosine, least = along(self.directions[1], pointing), np.cos(self.angle)
+        cosine = along(self.directions[1], pointing)
+        least = np.cos(self.angle)
         if (angle := parameters.get(UPRIGHT_TOLERANCE)) is not None:
             # Affine in the cosine, so that bound and accepted violation map to those of
             # the problem.
@@ -264,7 +265,8 @@ class Axis(TipAxis):
         second = [
             a + b for a, b in zip(_cross(alpha, u), _cross(omega, rate), strict=True)
         ]
-        zero, rows = np.zeros(2), self.across
+        zero = np.zeros(2)
+        rows = self.across
         return (
             Condition(
                 "tilt rate",

@@ -44,7 +44,8 @@ class DistanceConstraint(Constraint):
     ) -> tuple[Condition, ...]:
         """State that m distances are at least one bound, or m [m]."""
         m = len(distances)
-        lower, upper = np.full(m, least, float), np.full(m, np.inf)
+        lower = np.full(m, least, float)
+        upper = np.full(m, np.inf)
         return (
             Condition(
                 self.condition_name,
@@ -69,7 +70,9 @@ class RobotClearance(DistanceConstraint):
     links' capsules, which is conservative.
     """
 
-    reason, condition_name, bodies = "robot in collision", "robot clearance", "robot"
+    reason = "robot in collision"
+    condition_name = "robot clearance"
+    bodies = "robot"
     training_weight = 3000.0
     radius: float | None = field(
         'radius of the paper\'s capsules, with geometry = "paper-capsules" only',
@@ -171,7 +174,8 @@ class RobotClearance(DistanceConstraint):
 
     def solved(self, world: "World") -> tuple[Condition, ...]:
         """Return the conditions of the capsules."""
-        shape, capsule_axes = world.robot.shape, world.robot.capsule_axes
+        shape = world.robot.shape
+        capsule_axes = world.robot.capsule_axes
         # Solvers and judges use the same shapes here: capsules and upright obstacles.
         if shape is None and not _has_poses(world.obstacles):
             return self.measured(world)
@@ -209,7 +213,9 @@ class RobotClearance(DistanceConstraint):
 class ObjectContact(DistanceConstraint):
     """Constraint: the held object penetrates obstacles by at most ``depth`` (paper, Appendix B, object collision)."""
 
-    reason, condition_name, bodies = "object in collision", "object contact", "object"
+    reason = "object in collision"
+    condition_name = "object contact"
+    bodies = "object"
     training_weight, training_inset = 3e4, 5e-4  # the inset in m
     depth: float = field("depth of legal contact", unit="m", low=0.0, plausible=0.5)
     tolerance: float = field(
@@ -223,11 +229,9 @@ class ObjectContact(DistanceConstraint):
         """State the separation of the object from every obstacle [m]."""
         from cnpgen.kernels.symbolic.obstacle_distances import symbolic_solids
 
-        kin, size, solids = (
-            state.kinematics,
-            state.object_size or (0.0, 0.0, 0.0),
-            symbolic_solids(state),
-        )
+        kin = state.kinematics
+        size = state.object_size or (0.0, 0.0, 0.0)
+        solids = symbolic_solids(state)
         distances = [
             solid.cuboid_separation(kin.tip, kin.rotation, size) for solid in solids
         ]

@@ -61,7 +61,8 @@ class _RelativeLimit(Constraint):
             return ()
         # A limit times a factor is the same as a rate divided by it.
         g = list(rates) if factor is None else [rate / factor for rate in rates]
-        limit, unit = getattr(state.robot, self.limit), state.robot.units(self.unit)
+        limit = getattr(state.robot, self.limit)
+        unit = state.robot.units(self.unit)
         return (Condition(self.condition_name, unit, g, -limit, limit, "limit"),)
 
 
@@ -75,7 +76,8 @@ class JointPosition(Constraint):
     """Constraint: joint positions are within their limits: ``lower <= q <= upper``."""
 
     reason = "joint position limit"
-    training_weight, training_factor = 4000.0, 0.999
+    training_weight = 4000.0
+    training_factor = 0.999
     tolerance: float = field(
         "violation that a valid motion may have", unit="rad", low=0.0, plausible=1.0
     )
@@ -94,13 +96,12 @@ class JointVelocity(_RelativeLimit):
     """Constraint: joint velocities are within their limits: ``|dq| <= limit``."""
 
     reason = "joint velocity limit"
-    training_weight, training_factor = 100.0, 0.99
-    condition_name, unit, rates, limit = (
-        "joint velocity",
-        "rad/s",
-        "dq",
-        "velocity_limit",
-    )
+    training_weight = 100.0
+    training_factor = 0.99
+    condition_name = "joint velocity"
+    unit = "rad/s"
+    rates = "dq"
+    limit = "velocity_limit"
     factor_name = "velocity_factor"
 
 
@@ -109,13 +110,12 @@ class JointAcceleration(_RelativeLimit):
     """Constraint: joint accelerations are within their limits: ``|ddq| <= limit``."""
 
     reason = "joint acceleration limit"
-    training_weight, training_factor = 5.0, 0.985
-    condition_name, unit, rates, limit = (
-        "joint acceleration",
-        "rad/s^2",
-        "ddq",
-        "acceleration_limit",
-    )
+    training_weight = 5.0
+    training_factor = 0.985
+    condition_name = "joint acceleration"
+    unit = "rad/s^2"
+    rates = "ddq"
+    limit = "acceleration_limit"
     factor_name = "acceleration_factor"
 
 
@@ -127,8 +127,12 @@ class JointJerk(_RelativeLimit):
     """
 
     reason = "joint jerk limit"
-    training_weight, training_factor = 0.01, 0.97
-    condition_name, unit, rates, limit = "joint jerk", "rad/s^3", "jerk", "jerk_limit"
+    training_weight = 0.01
+    training_factor = 0.97
+    condition_name = "joint jerk"
+    unit = "rad/s^3"
+    rates = "jerk"
+    limit = "jerk_limit"
     uses_jerk: ClassVar[bool] = True
 
 
@@ -141,8 +145,12 @@ class JointTorque(_RelativeLimit):
     """
 
     reason = "joint torque limit"
-    training_weight, training_factor = 1.5, 0.97
-    condition_name, unit, rates, limit = "joint torque", "N m", "torque", "torque_limit"
+    training_weight = 1.5
+    training_factor = 0.97
+    condition_name = "joint torque"
+    unit = "N m"
+    rates = "torque"
+    limit = "torque_limit"
 
     def _within(
         self, state: "SymbolicState | World", factor: Any

@@ -55,11 +55,9 @@ class SelfClearance(LinkClearance):
     links do; only judges check the other pairs.
     """
 
-    reason, condition_name, bodies = (
-        "robot in collision with itself",
-        "self clearance",
-        "self",
-    )
+    reason = "robot in collision with itself"
+    condition_name = "self clearance"
+    bodies = "self"
     distance: float = field(
         "minimum distance of links", unit="m", low=0.0, default=0.0, plausible=2.0
     )
@@ -73,10 +71,8 @@ class SelfClearance(LinkClearance):
 
     def measured(self, world: "World") -> tuple[Condition, ...]:
         """Measure the signed distances of the convex parts with Coal [m]."""
-        distances, parts = (
-            world.self_distances(self.distance),
-            names_of_pairs(world.robot.shape),
-        )
+        distances = world.self_distances(self.distance)
+        parts = names_of_pairs(world.robot.shape)
         return self._at_least(distances, self.distance, parts=parts)
 
     def solved(self, world: "World") -> tuple[Condition, ...]:
@@ -143,11 +139,9 @@ class ObjectClearance(LinkClearance):
     capsules of links whose capsules hardly ever overlap the object unless the links do.
     """
 
-    reason, condition_name, bodies = (
-        "object in collision with the robot",
-        "object clearance",
-        "held object",
-    )
+    reason = "object in collision with the robot"
+    condition_name = "object clearance"
+    bodies = "held object"
     training_weight = 3000.0
     distance: float = field(
         "minimum distance of the object from the links",
@@ -168,7 +162,8 @@ class ObjectClearance(LinkClearance):
         """State the distances of the capsules' axes from the object [m]."""
         from cnpgen.kernels.symbolic.obstacle_distances import held_cuboid
 
-        cuboid, capsules = held_cuboid(state), _solver_capsules(state.robot)
+        cuboid = held_cuboid(state)
+        capsules = _solver_capsules(state.robot)
         axes = [state.held_capsules[capsule.link] for capsule in capsules]
         distances = [
             cuboid.separation(first, second, state.freeze) for first, second, _ in axes
@@ -177,10 +172,8 @@ class ObjectClearance(LinkClearance):
 
     def measured(self, world: "World") -> tuple[Condition, ...]:
         """Measure the signed distances of the convex parts with Coal [m]."""
-        distances, parts = (
-            world.held_object_distances(self.distance),
-            names_of_pairs(world.robot.held_shape),
-        )
+        distances = world.held_object_distances(self.distance)
+        parts = names_of_pairs(world.robot.held_shape)
         return self._at_least(distances, self.distance, parts=parts)
 
     def solved(self, world: "World") -> tuple[Condition, ...]:

@@ -26,11 +26,10 @@ class Plane(TipManifold):
 
     reason = "off the plane"
     kinks = BOUND_KINKS
-    inside_name, held_name = "plane rectangle", "plane distance"
-    velocity_name, acceleration_name = (
-        "velocity across the plane",
-        "acceleration across the plane",
-    )
+    inside_name = "plane rectangle"
+    held_name = "plane distance"
+    velocity_name = "velocity across the plane"
+    acceleration_name = "acceleration across the plane"
     point: Vector = field("point of the plane", unit="m")
     normal: Vector = field("normal of the plane, of any length")
     along: Vector | None = field(
@@ -99,11 +98,10 @@ class Line(TipManifold):
 
     reason = "off the line"
     kinks = BOUND_KINKS
-    inside_name, held_name = "line piece", "line distance"
-    velocity_name, acceleration_name = (
-        "velocity across the line",
-        "acceleration across the line",
-    )
+    inside_name = "line piece"
+    held_name = "line distance"
+    velocity_name = "velocity across the line"
+    acceleration_name = "acceleration across the line"
     point: Vector = field("point of the line", unit="m")
     direction: Vector = field("direction of the line, of any length")
     piece: Range | None = field(

@@ -28,11 +28,10 @@ class Pose(TipManifold):
     """
 
     reason = "not in its pose"
-    inside_name, held_name = "pose box", "pose position"
-    velocity_name, acceleration_name = (
-        "velocity out of the pose",
-        "acceleration out of the pose",
-    )
+    inside_name = "pose box"
+    held_name = "pose position"
+    velocity_name = "velocity out of the pose"
+    acceleration_name = "acceleration out of the pose"
     rpy: tuple[float, float, float] = field(
         "orientation in the world: roll, pitch, yaw, as in a URDF",
         unit="rad",
@@ -66,11 +65,9 @@ class Pose(TipManifold):
     def rotation(self) -> Array:
         """Required rotation, shape (3, 3)."""
         (cr, cp, cy), (sr, sp, sy) = np.cos(self.rpy), np.sin(self.rpy)
-        roll, pitch, yaw = (
-            np.array([[1, 0, 0], [0, cr, -sr], [0, sr, cr]]),
-            np.array([[cp, 0, sp], [0, 1, 0], [-sp, 0, cp]]),
-            np.array([[cy, -sy, 0], [sy, cy, 0], [0, 0, 1]]),
-        )
+        roll = np.array([[1, 0, 0], [0, cr, -sr], [0, sr, cr]])
+        pitch = np.array([[cp, 0, sp], [0, 1, 0], [-sp, 0, cp]])
+        yaw = np.array([[cy, -sy, 0], [sy, cy, 0], [0, 0, 1]])
         # URDF convention, fixed axes: R = Rz(yaw) Ry(pitch) Rx(roll).
         return np.asarray(yaw @ pitch @ roll)
 
@@ -112,11 +109,10 @@ class Pose(TipManifold):
 
     def _resting(self, state: "SymbolicState | World") -> tuple[Condition, ...]:
         """State that the tip moves along its free directions only and does not turn."""
-        zero, axes = np.zeros(3), ("x", "y", "z")
-        omega, alpha = (
-            list(state.tip_angular_velocity),
-            list(state.tip_angular_acceleration),
-        )
+        zero = np.zeros(3)
+        axes = ("x", "y", "z")
+        omega = list(state.tip_angular_velocity)
+        alpha = list(state.tip_angular_acceleration)
         return (
             *self._moving(state.tip_velocity, state.tip_acceleration),
             Condition("turning", "rad/s", omega, zero, zero, "velocity", axes),

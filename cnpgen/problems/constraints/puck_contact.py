@@ -98,7 +98,8 @@ class PuckContact(Constraint):
 
     def scene_values(self, goal_xyz: Array, goal_velocity: Array) -> Array:
         """Return the goal and the puck of N motions: x and y of both [m], shape (N, 4); out of reach if at rest."""
-        goal, velocity = goal_xyz[:, :2], goal_velocity[:, :2]
+        goal = goal_xyz[:, :2]
+        velocity = goal_velocity[:, :2]
         speed = np.hypot(velocity[:, :1], velocity[:, 1:])
         is_hit = speed > MIN_HIT_SPEED_M_S
         # Ahead of the tip along its velocity; the floor only avoids a division by zero.
@@ -177,7 +178,8 @@ class PuckContact(Constraint):
         # Without values there is no puck.
         if not len(values):
             return np.full(np.shape(x), PUCK_OUT_OF_REACH_M)
-        goal, puck = np.asarray(values[:2]), np.asarray(values[2:4])
+        goal = np.asarray(values[:2])
+        puck = np.asarray(values[2:4])
         # Center of the disc: half its diameter behind the goal, opposite to the hit.
         center = goal - (puck - goal) * (self.last / 2 / self.contact_distance)
         distance = np.hypot(x - center[0], y - center[1])

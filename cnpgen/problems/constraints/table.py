@@ -30,8 +30,10 @@ class Table(TipManifold):
     training_inset = 1e-3  # m
     kinks = BOUND_KINKS
     moves_with_table = True
-    inside_name, held_name = "table rectangle", "table height"
-    velocity_name, acceleration_name = "vertical velocity", "vertical acceleration"
+    inside_name = "table rectangle"
+    held_name = "table height"
+    velocity_name = "vertical velocity"
+    acceleration_name = "vertical acceleration"
     parts = (("x", "y"), ())
     x: Range = field("range of the tip along world x", unit="m")
     y: Range = field("range of the tip along world y", unit="m")
@@ -78,7 +80,8 @@ class Table(TipManifold):
 
     def judged(self, world: "World") -> tuple[Condition, ...]:
         """Evaluate the tip position with the rectangle of the sample."""
-        conditions, values = self.measured(world), world.parameters.values
+        conditions = self.measured(world)
+        values = world.parameters.values
         # The rectangle is that of the problem file.
         if values.keys().isdisjoint(TABLE_BOUNDS):
             return conditions

@@ -111,10 +111,8 @@ class TipManifold(Constraint):
         position = self._position(
             self._measured_tip(world), self._band_at(end), world.parameters.values
         )
-        rates, turned = (
-            (world.tip_velocity, world.tip_acceleration),
-            world.parameters.along_table,
-        )
+        rates = (world.tip_velocity, world.tip_acceleration)
+        turned = world.parameters.along_table
         return (
             *position,
             *self._moving(*(map(turned, rates) if self.moves_with_table else rates)),
@@ -163,7 +161,8 @@ class TipManifold(Constraint):
         if place.held:
             # row . p - height is the distance from the manifold along a fixed
             # direction.
-            low, high = place.height - band, place.height + band
+            low = place.height - band
+            high = place.height + band
             g = [along(row, tip) for row in place.held]
             found.append(
                 Condition(self.held_name, "m", g, low, high, "position", self.parts[1])
@@ -184,7 +183,8 @@ class TipManifold(Constraint):
         self, velocity: Sequence[Any] | Array, acceleration: Sequence[Any] | Array
     ) -> tuple[Condition, ...]:
         """State that the tip moves along the manifold only."""
-        held, parts = self.place.held, self.parts[1]
+        held = self.place.held
+        parts = self.parts[1]
         # A region without fixed directions leaves the velocity free.
         if not held:
             return ()

@@ -50,10 +50,8 @@ def observe(
     """
     from cnpgen.kernels.observation.compiled_observations import observation_backend
 
-    observation, seed = (
-        as_observation(kind),
-        integer("seed", seed, least=0, most=MAX_SEED),
-    )
+    observation = as_observation(kind)
+    seed = integer("seed", seed, least=0, most=MAX_SEED)
     bodies = scene_bodies(scenes)
     return observation.observe(
         bodies, scene_seeds(seed, len(bodies)), observation_backend()

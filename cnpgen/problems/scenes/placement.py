@@ -92,10 +92,12 @@ def _placed_obstacles(
 ) -> tuple[list[Obstacle], list[AttachedObject]]:
     """Return the obstacles in the frame of the robot's base, and those that links may touch."""
     request = scene.request
-    obstacles, touchable = list[Obstacle](), list[AttachedObject]()
+    obstacles = list[Obstacle]()
+    touchable = list[AttachedObject]()
     touching = request.obstacle_touch_links or ((),) * len(scene.obstacles)
     for index, (each, names) in enumerate(zip(scene.obstacles, touching, strict=True)):
-        frame, what = request.frame_of(index), f"obstacle {each.name!r}"
+        frame = request.frame_of(index)
+        what = f"obstacle {each.name!r}"
         pose = frames.pose(frame, what)
         obstacle = moved_obstacle(each, pose) if frame else each
         # An obstacle that links may touch becomes a fixed body of the robot, whose
@@ -127,7 +129,8 @@ class LinkFrames:
     def __init__(self, scene: SceneProblem, robot: Robot, start: Array) -> None:
         import pinocchio as pin
 
-        self._scene, self._model = scene, robot.model
+        self._scene = scene
+        self._model = robot.model
         tree = urdf_tree(robot.urdf_text)
         self.links = tuple(link.get("name", "") for link in tree.findall("link"))
         # Links are placed at the start state.

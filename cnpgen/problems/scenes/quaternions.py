@@ -50,7 +50,8 @@ def roll_pitch_yaw(rotation: Array) -> tuple[float, float, float]:
     """Return roll, pitch and yaw about fixed axes [rad] of a rotation matrix, as ``<origin rpy>`` of a URDF."""
     # R = Rz(yaw) Ry(pitch) Rx(roll): R_20 = -sin(pitch), and (R_00, R_10) has the
     # length |cos(pitch)|.
-    sine, cosine = -rotation[2, 0], math.hypot(rotation[0, 0], rotation[1, 0])
+    sine = -rotation[2, 0]
+    cosine = math.hypot(rotation[0, 0], rotation[1, 0])
     if cosine < 1e-9:
         # Pitch of 90 degrees: roll and yaw turn about the same axis.
         return (
@@ -58,8 +59,6 @@ def roll_pitch_yaw(rotation: Array) -> tuple[float, float, float]:
             math.atan2(sine, cosine),
             0.0,
         )
-    roll, yaw = (
-        math.atan2(rotation[2, 1], rotation[2, 2]),
-        math.atan2(rotation[1, 0], rotation[0, 0]),
-    )
+    roll = math.atan2(rotation[2, 1], rotation[2, 2])
+    yaw = math.atan2(rotation[1, 0], rotation[0, 0])
     return roll, math.atan2(sine, cosine), yaw

@@ -28,7 +28,8 @@ from cnpgen.schema.arguments import check_range, number
 from cnpgen.schema.keys import PerJoint
 
 MAX_HELD_ERROR = 1e-3  # rad or m
-MIN_PAYLOAD_KG, MAX_PAYLOAD_KG = 1e-6, 1e4
+MIN_PAYLOAD_KG = 1e-6
+MAX_PAYLOAD_KG = 1e4
 
 _LOG = logging.getLogger(__name__)
 
@@ -91,7 +92,8 @@ def requested_problem(
 
 def _report_held_joints(problem: Problem, scenes: Sequence[SceneProblem]) -> None:
     """Warn of joints that the problem holds at other positions than the start states of scenes, and of unknown ones."""
-    spec, tree = problem.robot, urdf_tree(problem.urdf_text)
+    spec = problem.robot
+    tree = urdf_tree(problem.urdf_text)
     moving = {
         each.get("name", "")
         for each in tree.iter("joint")
@@ -186,8 +188,10 @@ def _with_objects(
     # Objects of the world become links here, so that self-clearance applies to them.
     if not all(item.link for item in objects):
         _check_clearances(problem, scene)
-    record, names = record_problem(problem), {item.name for item in objects}
-    text, root = record.urdf, root_link(record.urdf)
+    record = record_problem(problem)
+    names = {item.name for item in objects}
+    text = record.urdf
+    root = root_link(record.urdf)
     try:
         for item in objects:
             text = with_attached_link(
@@ -239,7 +243,8 @@ def _with_sizes(
 
 def _check_clearances(problem: Problem, scene: SceneProblem) -> None:
     """Raise SceneError if links keep another distance from an object of the world that is a link than from others."""
-    own, others = problem.first(SelfClearance), problem.first(RobotClearance)
+    own = problem.first(SelfClearance)
+    others = problem.first(RobotClearance)
     if own is None or others is None or own.distance != others.distance:
         raise SceneError(
             f"{scene.place} allows collisions of links with objects of the world, and the problem"

@@ -210,7 +210,8 @@ def make_mesh(
         UsageError: An argument has another shape.
     """
     where = f"{place}: obstacle {name!r}" if place else f"obstacle {name!r}"
-    vertices, origin = numbers("points", points), numbers("position", position)
+    vertices = numbers("points", points)
+    origin = numbers("position", position)
     turn = numbers("rotation", rotation)
     if not vertices.size:
         raise SceneError(f"{where} is a mesh without vertices", concerns="points")
@@ -345,7 +346,8 @@ def checked_scene(scene: SceneProblem) -> SceneProblem:
         ]
     )
     if len(depths) and depths.max() > MAX_BASE_DEPTH_M:
-        name, depth = scene.obstacles[int(depths.argmax())].name, float(depths.max())
+        name = scene.obstacles[int(depths.argmax())].name
+        depth = float(depths.max())
         raise SceneError(
             f"{scene.place}: obstacle {name!r} contains the robot's base, the origin, at a depth of {depth:.3g} m,"
             f" expected at most {MAX_BASE_DEPTH_M:g} m: poses are relative to the base"
@@ -365,7 +367,8 @@ def _depth_of_base(obstacle: Obstacle) -> float:
 
 def _uniquely_named(obstacles: tuple[Obstacle, ...]) -> tuple[Obstacle, ...]:
     """Append numbers to names that occur more than once."""
-    counts, seen = Counter(obstacle.name for obstacle in obstacles), Counter[str]()
+    counts = Counter(obstacle.name for obstacle in obstacles)
+    seen = Counter[str]()
     renamed = []
     for obstacle in obstacles:
         seen[obstacle.name] += 1

@@ -135,9 +135,12 @@ def _has_acceleration(problem: Problem, world: World, torque: JointTorque) -> bo
     import pinocchio as pin
     from scipy.optimize import linprog
 
-    robot, q, dq = world.robot, world.q, world.dq
+    robot = world.robot
+    q = world.q
+    dq = world.dq
     acceleration = joint_limits(problem, robot, tolerances=1.0).acceleration
-    model, data = world.parameters.model, world.parameters.model.createData()
+    model = world.parameters.model
+    data = world.parameters.model.createData()
     # tau(ddq) = M ddq + bias: columns of the inertia matrix M are tau(unit) - bias.
     bias = np.array(pin.rnea(model, data, q, dq, np.zeros(robot.n)))
     inertia = np.array(

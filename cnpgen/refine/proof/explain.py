@@ -126,7 +126,8 @@ def _cannot_brake(problem: Problem, robot: Robot, boundary: Boundary) -> Iterato
             lower, upper = state.box(float(time), limits)
             # An empty box: the joint cannot be within its range at this time.
             for joint in np.flatnonzero(lower > upper + POSITION_MARGIN_RAD):
-                instant, name = _time_text(end, float(time)), robot.joint_names[joint]
+                instant = _time_text(end, float(time))
+                name = robot.joint_names[joint]
                 violation = float(lower[joint] - upper[joint]) - POSITION_MARGIN_RAD
                 unit = unit_of(robot.units("rad"), int(joint))
                 yield f"{instant} {name} is {violation:.2g} {unit} or more outside its range, for any acceleration"

@@ -41,10 +41,8 @@ def joint_limits(problem: Problem, robot: Robot, *, tolerances: float) -> JointL
     for constraint in problem.constraint:
         tolerance = tolerances * constraint.tolerance
         if isinstance(constraint, JointPosition):
-            lower, upper = (
-                robot.position_lower - tolerance,
-                robot.position_upper + tolerance,
-            )
+            lower = robot.position_lower - tolerance
+            upper = robot.position_upper + tolerance
         elif isinstance(constraint, JointVelocity):
             velocity = robot.velocity_limit * (1 + tolerance)
         elif isinstance(constraint, JointAcceleration):

@@ -54,7 +54,8 @@ class TableBounds:
         ``HEIGHT_WEIGHT`` times that of the height.
         """
         violation = self.normals @ tip - self.limits
-        rectangle, height = violation[~self.height].max(), violation[self.height].max()
+        rectangle = violation[~self.height].max()
+        height = violation[self.height].max()
         return max(float(rectangle), MIN_VIOLATION_M) + HEIGHT_WEIGHT * max(
             float(height), 0.0
         )
@@ -133,7 +134,8 @@ def find_table_exit(
     problem: Problem, robot: Robot, boundary: Boundary
 ) -> TableExit | None:
     """Find a proven exit of one motion from a table, or one within ``VERGE_DISTANCE_M`` of the edge, or None."""
-    arm, nearly = ArmKinematics(robot), None
+    arm = ArmKinematics(robot)
+    nearly = None
     start_tip = arm.at(boundary.start_q[0]).position
     exact, wide = (
         table_bounds(problem, start_tip, tolerances=tolerances)
@@ -191,10 +193,8 @@ def _prove(
     for item in positive[:MAX_PROOFS]:
         # Multipliers m >= 0 combine the bounds. If (normals^T m) . tip > limits . m for
         # all reachable tips, not all bounds hold.
-        direction, limit = (
-            bounds.normals.T @ item.multipliers,
-            float(bounds.limits @ item.multipliers),
-        )
+        direction = bounds.normals.T @ item.multipliers
+        limit = float(bounds.limits @ item.multipliers)
         # A proof of most of the distance is tried first, then one of any violation.
         for fraction in (0.8, 0.0):
             bound = bound_projection(
@@ -209,7 +209,8 @@ def _smallest(
     arm: ArmKinematics, bounds: TableBounds, time: float, box: tuple[Array, Array]
 ) -> TableViolation:
     """Search from several configurations; stop at one without violation."""
-    random, violations = np.random.default_rng(0), list[TableViolation]()
+    random = np.random.default_rng(0)
+    violations = list[TableViolation]()
     center = (box[0] + box[1]) / 2
     for q in (center, *(random.uniform(*box) for _ in range(LOCAL_SEARCHES - 1))):
         violations.append(TableViolation(time, *_search(arm, bounds, q, box), box))
@@ -238,7 +239,9 @@ def _search(
         # A step is accepted if the violation decreases; otherwise the region of the
         # linearization shrinks.
         if new < value:
-            gain, q, value = value - new, q + step, new
+            gain = value - new
+            q = q + step
+            value = new
             if gain < MIN_GAIN_M:
                 break
         elif value - predicted < MIN_GAIN_M:
@@ -254,7 +257,8 @@ def _linear_step(
     """Minimize the linearized violation: (step, predicted violation, multipliers), or None without a solution."""
     from scipy.optimize import linprog
 
-    tip, n = arm.at(q), len(q)
+    tip = arm.at(q)
+    n = len(q)
     # One elastic variable for the rectangle and one for the height; their weighted sum
     # is minimized.
     elastic = np.stack([~bounds.height, bounds.height], axis=1)

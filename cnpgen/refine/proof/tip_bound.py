@@ -37,7 +37,8 @@ class ArmKinematics:
     """Positions of the tip by Pinocchio."""
 
     def __init__(self, robot: Robot) -> None:
-        self._model, self._data = robot.model, robot.model.createData()
+        self._model = robot.model
+        self._data = robot.model.createData()
         self._frame = robot.tip_frame
         joints = robot.chain.joints
         strokes = (
@@ -82,7 +83,8 @@ def bound_projection(
     The direction has shape (3,), the lower and upper ends of the box [rad] shape (n,),
     the threshold is ``above`` [m].
     """
-    boxes, bound = [(lower, upper)], np.inf
+    boxes = [(lower, upper)]
+    bound = np.inf
     for _ in range(MAX_BOXES):
         low, high = boxes.pop()
         low, high, box_bound, loss = _bound_box(arm, direction, low, high)
@@ -96,7 +98,8 @@ def bound_projection(
         # A position at or below the threshold disproves the bound.
         if direction @ arm.at((low + high) / 2).position <= above or loss[joint] == 0:
             return None
-        left, right = high.copy(), low.copy()
+        left = high.copy()
+        right = low.copy()
         left[joint] = right[joint] = center
         boxes += [(low, left), (right, high)]
     return None
@@ -114,15 +117,14 @@ def _bound_box(
         # Taylor series about the center of the box: value, gradient, curvature, and a
         # bound of the rest.
         tip = arm.at((low + high) / 2)
-        gradient, curvature = direction @ tip.jacobian, np.abs(tip.curvature(direction))
+        gradient = direction @ tip.jacobian
+        curvature = np.abs(tip.curvature(direction))
         second, third = _remainders(arm.reach * float(np.linalg.norm(direction)), half)
         change = curvature @ half + second
         # A gradient that keeps its sign in the whole box puts the minimum on one of its
         # sides.
-        rising, falling = (
-            (half > 0) & (gradient > change),
-            (half > 0) & (-gradient > change),
-        )
+        rising = (half > 0) & (gradient > change)
+        falling = (half > 0) & (-gradient > change)
         if not (rising | falling).any():
             # The joint with the largest contribution is split next.
             joint_loss = half * (np.abs(gradient) + change)

@@ -116,7 +116,8 @@ class Bounds:
             for k, weights in enumerate(midpoint_weights.T)
         )
         # Of the intervals between the second and the last but one.
-        left, right = slice(1, -2), slice(2, -1)
+        left = slice(1, -2)
+        right = slice(2, -1)
         tolerance = INTERVAL_FRACTION * np.minimum(
             self.interval_tolerance[left], self.interval_tolerance[right]
         )
@@ -124,7 +125,8 @@ class Bounds:
         below = np.minimum(self.lower[left], self.lower[right]) - centers - tolerance
         if not (above.max() > 0 or below.max() > 0):
             return None
-        lower, upper = self.lower.copy("F"), self.upper.copy("F")
+        lower = self.lower.copy("F")
+        upper = self.upper.copy("F")
         # Both neighbors of a midpoint move inwards by the overshoot there.
         for side in (left, right):
             upper[side] -= np.maximum(above, 0.0)
@@ -137,10 +139,8 @@ def condition_orders(problem: Problem, world: World) -> list[int]:
 
     Problems that differ only in poses and sizes of obstacles share the result.
     """
-    forms, structure = (
-        [constraint.solved for constraint in problem.constraint],
-        problem.structure,
-    )
+    forms = [constraint.solved for constraint in problem.constraint]
+    structure = problem.structure
     rest = [np.zeros(world.robot.n)] * (3 if problem.uses_jerk else 2)
     if structure is not None and structure in _ORDERS:
         world.set_state(
@@ -266,14 +266,16 @@ class BoundsTemplate:
         free. Bounds near an end that violates them within the tolerance are relaxed by
         the violation: no motion meets narrower ones.
         """
-        lower, upper = self._lower, self._upper
+        lower = self._lower
+        upper = self._upper
         for constraint, condition, columns in self._time_varying:
             relaxation = constraint.bound_relaxation(
                 condition, self._bound_phases, start_tip
             )
             if np.any(relaxation > 0):
                 scale = _scale(constraint, condition)
-                lower, upper = lower.copy("F"), upper.copy("F")
+                lower = lower.copy("F")
+                upper = upper.copy("F")
                 lower[:, columns] -= relaxation[:, None] / scale
                 upper[:, columns] += relaxation[:, None] / scale
         bounds = Bounds(lower, upper, self._nonsmooth, self._interval_tolerance)
@@ -284,14 +286,13 @@ class BoundsTemplate:
         columns = np.isfinite(self._position_scale)
         if columns.sum() != positions.shape[1]:
             return bounds
-        scale, band, inner = (
-            self._position_scale[columns],
-            NEAR_FRACTION * distance,
-            self._s < 1,
-        )
+        scale = self._position_scale[columns]
+        band = NEAR_FRACTION * distance
+        inner = self._s < 1
         # |q - q_path| <= distance, in scaled units: the tighter of both bounds holds
         rows = np.ix_(inner, columns)
-        lower, upper = bounds.lower.copy("F"), bounds.upper.copy("F")
+        lower = bounds.lower.copy("F")
+        upper = bounds.upper.copy("F")
         lower[rows] = np.maximum(lower[rows], (positions[inner] - band) / scale)
         upper[rows] = np.minimum(upper[rows], (positions[inner] + band) / scale)
         return Bounds(lower, upper, bounds.nonsmooth, bounds.interval_tolerance)
@@ -324,7 +325,8 @@ class BoundsTemplate:
         )
 
     def _relaxed_at_ends(self, bounds: Bounds, ends: Array) -> Bounds:
-        lower, upper = bounds.lower, bounds.upper
+        lower = bounds.lower
+        upper = bounds.upper
         if (
             not np.fmax.reduce(bounds.end_violations(ends), axis=None)
             > MIN_END_RELAXATION
@@ -336,7 +338,8 @@ class BoundsTemplate:
             (ends[0], 0, fades[0]),
             (ends[1], -2, fades[1]),
         ):
-            above, below = np.fmax(g - upper[row], 0.0), np.fmax(lower[row] - g, 0.0)
+            above = np.fmax(g - upper[row], 0.0)
+            below = np.fmax(lower[row] - g, 0.0)
             if np.any(above > 0):
                 upper = np.asfortranarray(
                     upper + np.minimum(above, self.tolerances) * fade
@@ -357,7 +360,8 @@ class BoundsTemplate:
 
 def near_ends(s: Array) -> Array:
     """Return the share of the violation of the start and of the goal that bounds accept at phases, shape (2, K, 1)."""
-    until, from_full = END_RELAXATION[1], END_RELAXATION[1] - END_RELAXATION[0]
+    until = END_RELAXATION[1]
+    from_full = END_RELAXATION[1] - END_RELAXATION[0]
     return np.clip((until - np.stack([s, 1 - s])) / from_full, 0.0, 1.0)[..., None]
 
 
@@ -397,18 +401,23 @@ def _bounds(
             1
             - fraction * np.clip(np.minimum(s, 1 - s) / tightening.edge, 0, 1)[:, None]
         )
-        center, half = (lower + upper) / 2, (upper - lower) / 2
-        lower, upper = center - shrink * half, center + shrink * half
+        center = (lower + upper) / 2
+        half = (upper - lower) / 2
+        lower = center - shrink * half
+        upper = center + shrink * half
     elif condition.is_equality:
         # An equality gets a band within its tolerance, so that the program has an interior.
         band = tightening.band * constraint.tolerance / scale
-        lower, upper = lower - band, upper + band
+        lower = lower - band
+        upper = upper + band
     elif not constraint.has_solver_margin:
         inside = _added_clearance(s, tightening)[:, None] / scale
-        lower, upper = lower + inside, upper - inside
+        lower = lower + inside
+        upper = upper - inside
     if order < 2:
         # Fixed by the boundary conditions.
-        lower[s == 1], upper[s == 1] = -np.inf, np.inf
+        lower[s == 1] = -np.inf
+        upper[s == 1] = np.inf
     return np.stack([lower, upper])
 
 

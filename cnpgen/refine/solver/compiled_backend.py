@@ -133,9 +133,11 @@ def load_step_library(kernels: KernelLibrary) -> ctypes.CDLL:
         MachineError: It is missing.
     """
     library = kernels.load_source(*SOURCES)
-    library.evaluate.argtypes, library.evaluate.restype = (c_void_p,) * 3, c_double
+    library.evaluate.argtypes = (c_void_p,) * 3
+    library.evaluate.restype = c_double
     build = (*(c_void_p,) * 3, *(c_double,) * 4, *(c_void_p,) * 3)
-    library.build_subproblem.restype, library.build_subproblem.argtypes = None, build
+    library.build_subproblem.restype = None
+    library.build_subproblem.argtypes = build
     solve = (
         *(c_void_p,) * 3,
         c_double,
@@ -157,18 +159,14 @@ class CompiledBackend:
 
     def __init__(self, motion: Transcription, bounds: Bounds) -> None:
         library = motion.kernels.step_library
-        self._evaluate, self._build, self._solve = (
-            library.evaluate,
-            library.build_subproblem,
-            library.solve_subproblem,
-        )
+        self._evaluate = library.evaluate
+        self._build = library.build_subproblem
+        self._solve = library.solve_subproblem
         # Keeps the memory of step.c alive.
         self._arrays: list[Any] = []
-        self._points, self._m, self._nx = (
-            len(motion.grid.s),
-            motion.kernels.values.tape.outputs[0],
-            motion.nx,
-        )
+        self._points = len(motion.grid.s)
+        self._m = motion.kernels.values.tape.outputs[0]
+        self._nx = motion.nx
         self._motion = self._describe(motion, bounds)
         self._address = ctypes.addressof(self._motion)
         self._activate = motion.activate
@@ -234,13 +232,12 @@ class CompiledBackend:
         relax: bool,
     ) -> Step | None:
         """Solve the program of the last subproblem; return None without a solution."""
-        dx, multipliers = np.empty(self._nx), np.zeros((self._m, self._points))
+        dx = np.empty(self._nx)
+        multipliers = np.zeros((self._m, self._points))
         before = None if warm is None else np.ascontiguousarray(warm.T)
         warm_start = None if before is None else address_of(before), MIN_MULTIPLIER
-        limits, results = (
-            (QP_TOLERANCE, MAX_WORKING_SET_CHANGES),
-            (address_of(dx), address_of(multipliers)),
-        )
+        limits = (QP_TOLERANCE, MAX_WORKING_SET_CHANGES)
+        results = (address_of(dx), address_of(multipliers))
         cost = subproblem.elastic_gradient, ELASTIC_CURVATURE_ROOT
         inputs = address_of(subproblem.g.T), address_of(box)
         if not self._solve(
@@ -256,7 +253,8 @@ class CompiledBackend:
 
     def _describe(self, motion: Transcription, bounds: Bounds) -> _Motion:
         # Rows of matrices are padded to whole vectors.
-        spec, stride = motion.spec, motion.nx + 2 + -(motion.nx + 2) % MAX_LANES
+        spec = motion.spec
+        stride = motion.nx + 2 + -(motion.nx + 2) % MAX_LANES
         path = end_derivatives(spec.path_control_points, spec.degree)
         rate = end_derivatives(spec.rate_control_points, spec.degree)
         return _Motion(
@@ -279,7 +277,8 @@ class CompiledBackend:
 
     def _constants(self, motion: Transcription, bounds: Bounds) -> dict[str, Any]:
         """Return the arrays and kernels that no step changes."""
-        grid, kernels = motion.grid, motion.kernels
+        grid = motion.grid
+        kernels = motion.kernels
         groups = (
             np.empty((0, 3))
             if kernels.cost_term is None
@@ -327,11 +326,12 @@ class CompiledBackend:
 
     def _work_arrays(self, motion: Transcription, stride: int) -> dict[str, int]:
         """Allocate the work arrays with the sizes of step.c."""
-        spec, n, nx, size = motion.spec, motion.n, motion.nx, self._m * self._points
-        width, nodes = (
-            motion.kernels.values.tape.inputs[0],
-            len(motion.grid.cost_weights),
-        )
+        spec = motion.spec
+        n = motion.n
+        nx = motion.nx
+        size = self._m * self._points
+        width = motion.kernels.values.tape.inputs[0]
+        nodes = len(motion.grid.cost_weights)
         count = (
             0
             if motion.kernels.cost_residuals is None

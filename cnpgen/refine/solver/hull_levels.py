@@ -118,7 +118,8 @@ class HullFeedback:
         # last.
         fractions = np.arange(STATES_PER_INTERVAL) / STATES_PER_INTERVAL
         phases = (s[:-1, None] + np.diff(s)[:, None] * fractions).ravel()
-        self._spec, self._phases = spec, s
+        self._spec = spec
+        self._phases = s
         self._basis = basis(phases, spec.path_control_points, spec.degree)
         self._near_ends = near_ends(phases)
         self._margins = FEEDBACK_MARGIN_M * np.clip(
@@ -172,7 +173,8 @@ class HullFeedback:
         """
         # The interval of the collision and its neighbors: the motion will shift a little.
         interval = int(np.searchsorted(self._phases, phase)) - 1
-        first, last = max(interval - 1, 0), min(interval + 2, self._intervals)
+        first = max(interval - 1, 0)
+        last = min(interval + 2, self._intervals)
         window = np.linspace(
             self._phases[first],
             self._phases[last],

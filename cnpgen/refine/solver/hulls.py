@@ -37,10 +37,8 @@ from cnpgen.robots.shape.shape import HELD_OBJECT, Shape, with_held_object
 from cnpgen.world.rigid_bodies import RigidBodies
 
 Pairs = NDArray[np.intp]
-LINK_CONSTRAINTS, OBJECT_CONSTRAINTS = (
-    RobotClearance | SelfClearance,
-    ObjectContact | ObjectClearance,
-)
+LINK_CONSTRAINTS = RobotClearance | SelfClearance
+OBJECT_CONSTRAINTS = ObjectContact | ObjectClearance
 # Above the required distance; larger distances are not measured.
 MEASURED_RANGE_M = 0.04
 
@@ -79,7 +77,8 @@ class Hulls:
         with_object: bool = False,
     ) -> None:
         assert robot.shape is not None
-        shape, kinds = robot.shape, LINK_CONSTRAINTS
+        shape = robot.shape
+        kinds = LINK_CONSTRAINTS
         if with_object and problem.object_size is not None:
             shape = with_held_object(
                 robot.shape, robot.held_shape, robot.chain, problem.object_size
@@ -91,10 +90,8 @@ class Hulls:
         self._row_kernels: tuple[Kernel, RowKernels] | None = None
         self._obstacles = problem.obstacle
         bodies = RigidBodies(shape, len(problem.obstacle), robot.n)
-        self._link_pairs, self._obstacle_pairs = (
-            bodies.link_pairs,
-            bodies.obstacle_pairs,
-        )
+        self._link_pairs = bodies.link_pairs
+        self._obstacle_pairs = bodies.obstacle_pairs
         self._groups = list[_Group]()
         self._set_distances(constraints, self._make_groups(constraints, shape))
         # Largest required distances from obstacles and of links from each other [m];
@@ -115,10 +112,8 @@ class Hulls:
         names = [*links, *range(len(self._obstacles))]
         columns: dict[Any, int] = {}
         for constraint in constraints:
-            of_links, required = (
-                isinstance(constraint, SelfClearance | ObjectClearance),
-                _required(constraint),
-            )
+            of_links = isinstance(constraint, SelfClearance | ObjectClearance)
+            required = _required(constraint)
             pairs, numbers = self._pairs_of(constraint, names, of_links=of_links)
             # Parts of the same link share a column: its distance is the least of theirs.
             indices = [
@@ -190,10 +185,8 @@ class Hulls:
         """
         if not np.isfinite(q).all():
             return np.inf
-        least, violation = (
-            self.min_distances - (self.tolerances if above_tolerance else 0.0),
-            0.0,
-        )
+        least = self.min_distances - (self.tolerances if above_tolerance else 0.0)
+        violation = 0.0
         for _, column, distance in self._close(q, obstacle_poses, 0.0):
             below = least[column] - distance
             violation = max(violation, float(below.max(initial=0.0)))
@@ -221,7 +214,8 @@ class Hulls:
         self, kernels: ResidualKernels, obstacle_poses: Array
     ) -> RowKernels:
         """Return kernels whose rows end with the distances of ``measure``."""
-        checker, columns = self.placed_checker(obstacle_poses), self._columns
+        checker = self.placed_checker(obstacle_poses)
+        columns = self._columns
         if self._row_kernels is None or self._row_kernels[0] is not kernels.values:
             self._row_kernels = (
                 kernels.values,
@@ -260,7 +254,8 @@ class Hulls:
         self, q: Array, obstacle_poses: Array, within: float = MEASURED_RANGE_M
     ) -> Iterator[tuple[Pairs, Pairs, Array]]:
         """Yield states, columns and distances [m] of each constraint's pairs, closer than required plus ``within``."""
-        checker, found = self.placed_checker(obstacle_poses), dict[bool, Contacts]()
+        checker = self.placed_checker(obstacle_poses)
+        found = dict[bool, Contacts]()
         for kind, required in (
             (True, self.obstacle_distance),
             (False, self.self_distance),

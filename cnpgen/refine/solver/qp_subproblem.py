@@ -65,7 +65,8 @@ def local_maxima(violations: Array) -> Mask:
     peak[1:-1] = (violations[1:-1] >= violations[:-2]) & (
         violations[1:-1] >= violations[2:]
     )
-    peak[0], peak[-1] = violations[0] >= violations[1], violations[-1] >= violations[-2]
+    peak[0] = violations[0] >= violations[1]
+    peak[-1] = violations[-1] >= violations[-2]
     # Maxima move between steps: their neighbors take part, too. The thinned grid keeps
     # long flat parts from drifting over a bound unseen.
     mask = peak.copy("F")

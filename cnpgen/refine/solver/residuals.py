@@ -120,7 +120,9 @@ class CostTerm:
         weight)``, shapes (K,) and (m, K): ``weight * e`` is the gradient of rho in e,
         and the diagonal matrix of ``weight`` bounds its Hessian from above.
         """
-        rho, weights, first = np.zeros(e.shape[1]), np.empty(e.shape), 0
+        rho = np.zeros(e.shape[1])
+        weights = np.empty(e.shape)
+        first = 0
         for count, smoothing, weight in self.groups(counts).tolist():
             part = slice(first, first := first + int(count))
             squares = np.sum(e[part] * e[part], axis=0)

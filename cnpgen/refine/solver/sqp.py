@@ -63,11 +63,13 @@ MAX_REMAINING = 0.9
 # profitable.
 PENALTY_FACTOR = 3.0
 # Stalled: a larger fraction of the violation is left after so many steps.
-STALL_STEPS, STALL_FRACTION = 8, 0.9
+STALL_STEPS = 8
+STALL_FRACTION = 0.9
 # A stalled iteration with a smaller violation restores feasibility before it ends.
 MAX_RESTORED_VIOLATION = 0.02
 # Of the violation bound; smallest fraction of the predicted gain.
-BOUND_SHRINKAGE, MIN_GAIN_FRACTION = 0.7, 0.1
+BOUND_SHRINKAGE = 0.7
+MIN_GAIN_FRACTION = 0.1
 LAST_STEPS = 3  # before a deadline restore feasibility
 DEADLINE_PROXIMAL = 30.0  # weight of the proximal term in these
 # Tightenings of the bounds for violations between grid points.
@@ -75,7 +77,9 @@ MAX_MIDPOINT_CORRECTIONS = 2
 # Times the largest duration of a step so far is reserved for the next.
 STEP_TIME_FACTOR = 1.3
 # Of reduction to prediction: accept, enlarge, shrink.
-ACCEPTED_RATIO, GOOD_RATIO, POOR_RATIO = 0.05, 0.7, 0.3
+ACCEPTED_RATIO = 0.05
+GOOD_RATIO = 0.7
+POOR_RATIO = 0.3
 
 
 @dataclass(frozen=True)
@@ -188,7 +192,8 @@ class _Iterate:
     def __init__(
         self, motion: Transcription, bounds: Bounds, settings: Settings, x: Array
     ) -> None:
-        self._backend, self._motion = CompiledBackend(motion, bounds), motion
+        self._backend = CompiledBackend(motion, bounds)
+        self._motion = motion
         self._corrections = MAX_MIDPOINT_CORRECTIONS
         self.x = self._start = x
         self.cost, self._g, self.violation = self._backend.value(x)
@@ -198,14 +203,13 @@ class _Iterate:
         self._violations = (
             [self.violation] if self.violation <= settings.violation_tolerance else []
         )
-        self._bounds, self._settings = bounds, settings
+        self._bounds = bounds
+        self._settings = settings
         self._scale = np.ones(motion.nx)
         self._scale[motion.split :] = RATE_RADIUS_FACTOR
-        self._radius, self._violation_bound, self._penalty = (
-            settings.radius,
-            settings.violation_bound,
-            settings.penalty,
-        )
+        self._radius = settings.radius
+        self._violation_bound = settings.violation_bound
+        self._penalty = settings.penalty
         # Of the last step, in the norm of the trust region.
         self._step_length = MAX_RADIUS
         self._multipliers: Array | None = None
@@ -225,7 +229,8 @@ class _Iterate:
 
     def advance(self) -> None:
         """Try a step, and accept it or adapt the trust region and the selection."""
-        settings, self.tightened = self._settings, False
+        settings = self._settings
+        self.tightened = False
         # A step that only restores feasibility stays close to x: a large proximal weight
         # makes changes of the objective expensive, the constraints are unchanged.
         restore = self.restoring or self._cost_converged or self._stalled
@@ -255,10 +260,8 @@ class _Iterate:
         # A motion that is 1 % slower costs 1 % of its duration. Where the duration [s] is
         # larger than mu, a violation may pay for itself: raise mu above it.
         if self._is_stuck() and self._penalty < self.cost:
-            self._penalty, self._violations = (
-                PENALTY_FACTOR * self.cost,
-                [self.violation],
-            )
+            self._penalty = PENALTY_FACTOR * self.cost
+            self._violations = [self.violation]
         # Small violations that do not decrease any more: give up the objective once, and
         # restore feasibility before the iteration ends.
         if (
@@ -266,7 +269,8 @@ class _Iterate:
             and not self._stalled
             and self.violation < MAX_RESTORED_VIOLATION
         ):
-            self._stalled, self._violations = True, [self.violation]
+            self._stalled = True
+            self._violations = [self.violation]
         self.converged |= self._radius < MIN_RADIUS or self._is_stuck()
 
     def _restoration_weight(self) -> float:
@@ -280,14 +284,10 @@ class _Iterate:
     def _is_stuck(self) -> bool:
         """Return whether no iterate was feasible and the smallest violation hardly decreases any more."""
         # min over the last steps > 0.9 min over all earlier ones, and neither is feasible
-        before, recent = (
-            self._violations[:-STALL_STEPS],
-            self._violations[-STALL_STEPS:],
-        )
-        smallest, tolerance = (
-            min(before, default=0.0),
-            self._settings.violation_tolerance,
-        )
+        before = self._violations[:-STALL_STEPS]
+        recent = self._violations[-STALL_STEPS:]
+        smallest = min(before, default=0.0)
+        tolerance = self._settings.violation_tolerance
         return smallest > tolerance and min(recent) > max(
             STALL_FRACTION * smallest, tolerance
         )
@@ -352,13 +352,11 @@ class _Iterate:
             # residuals hold.
             restored = self._cost_converged or self._stalled or self.restoring
             self.converged = restored and violation < settings.violation_tolerance
-            self.x, self.cost, self._g, self.violation, self._step_length = (
-                x,
-                cost,
-                g,
-                violation,
-                size,
-            )
+            self.x = x
+            self.cost = cost
+            self._g = g
+            self.violation = violation
+            self._step_length = size
             self._missed[:] = False
             if self.converged and not self.restoring and self._corrections:
                 self._check_midpoints()
@@ -370,12 +368,10 @@ class _Iterate:
         tighter = self._bounds.tightened(self._g, self._motion.grid.midpoint_weights)
         if tighter is None:
             return
-        self.converged, self.tightened, self._corrections, self._bounds = (
-            False,
-            True,
-            self._corrections - 1,
-            tighter,
-        )
+        self.converged = False
+        self.tightened = True
+        self._corrections = self._corrections - 1
+        self._bounds = tighter
         self._backend = CompiledBackend(self._motion, tighter)
         self.violation = tighter.max_violation(self._g)
 

@@ -80,12 +80,10 @@ class Transcription:
         obstacle_poses: Array,
     ) -> None:
         spec = kernels.spec
-        self.kernels, self.spec, self.grid, self.boundary = (
-            kernels,
-            spec,
-            grid,
-            boundary,
-        )
+        self.kernels = kernels
+        self.spec = spec
+        self.grid = grid
+        self.boundary = boundary
         self.n = boundary.start_q.shape[1]
         # Index of the goal's control points.
         self._goal_points = spec.path_control_points - boundary.fixed_at_goal
@@ -153,12 +151,11 @@ class Transcription:
         """
         orders = len(self.grid.bases.path)
         # With r = 1 and r' = 0, w is the state itself.
-        b, unit = self.boundary, np.eye(1, orders - 1)[0]
+        b = self.boundary
+        unit = np.eye(1, orders - 1)[0]
         free = np.full(self.n, np.nan)
-        goal_ddq, jerk = (
-            free if b.goal_ddq is None else b.goal_ddq[0],
-            [free] * (orders - 3),
-        )
+        goal_ddq = free if b.goal_ddq is None else b.goal_ddq[0]
+        jerk = [free] * (orders - 3)
         start = np.concatenate(
             [b.start_q[0], b.start_dq[0], b.start_ddq[0], *jerk, unit]
         )
@@ -216,7 +213,8 @@ class Transcription:
     def linearization_errors(self, at: Linearization, step: float) -> Array:
         """Bound the change of residuals by derivatives of r if no log r changes by more than ``step``: (K, m)."""
         # |r^(i) after - before| <= sum_j |B_j^(i)| R_j step, to first order in the step
-        orders, errors = len(self.grid.bases.path), np.zeros(at.g.shape)
+        orders = len(self.grid.bases.path)
+        errors = np.zeros(at.g.shape)
         for order in range(1, orders - 1):
             change = np.abs(self.grid.bases.rate[order]) @ at.rate * step
             errors += np.abs(at.jacobian[orders * self.n + order]).T * change[:, None]
@@ -250,7 +248,8 @@ class Transcription:
         e, jacobian, weights = self._cost_residuals(path, rate)
         rho, rho_derivative = self.kernels.cost_term.rate(e, self.kernels.cost_counts)
         m, points = e.shape
-        k, residual = np.repeat(np.arange(points), m), np.tile(np.arange(m), points)
+        k = np.repeat(np.arange(points), m)
+        residual = np.tile(np.arange(m), points)
         rows = self._chain(jacobian[:, residual, k].T, k, rate, bases)
         row_weights = (weights * rho_derivative)[residual, k]
         gradient += (row_weights * e[residual, k]) @ rows
@@ -267,7 +266,9 @@ class Transcription:
         self, state_gradients: Array, k: Indices, rate: Array, bases: Bases
     ) -> Array:
         """Convert gradients in w at nodes k, shape (m, width of w), to gradients in the variables, (m, nx)."""
-        n, m, orders = self.n, len(k), len(bases.path)
+        n = self.n
+        m = len(k)
+        orders = len(bases.path)
         # dg/dC = sum over orders of B^(i) dg/dp^(i), for all control points, also those
         # that the boundary conditions determine
         control = bases.path_at[k] @ state_gradients[:, : orders * n].reshape(

@@ -108,10 +108,8 @@ def convex_mesh(address: str) -> ConvexMesh:
     from scipy.spatial import ConvexHull
 
     corners = corners_of(address)
-    center, half = (
-        (corners.max(axis=0) + corners.min(axis=0)) / 2,
-        np.ptp(corners, axis=0) / 2,
-    )
+    center = (corners.max(axis=0) + corners.min(axis=0)) / 2
+    half = np.ptp(corners, axis=0) / 2
     # Relative to the center of the bounding box: sizes and centers are then consistent.
     hull = ConvexHull(corners - center)
     first, second, third = (hull.points[index] for index in hull.simplices.T)
@@ -174,7 +172,8 @@ def primitives_of(obstacles: Sequence[Obstacle], numbers: Array) -> Primitives:
     Poses and sizes (``cnpgen.robots.solid``) have shape (pose_width,), or of N samples
     (N, pose_width), which gives arrays with a first axis of length N.
     """
-    shape, rows = numbers.shape[:-1], np.atleast_2d(numbers)
+    shape = numbers.shape[:-1]
+    rows = np.atleast_2d(numbers)
     kinds, centers, rotations, sizes = _padding(len(rows), len(obstacles))
     meshes: list[ConvexMesh] = []
     for index, (obstacle, part) in enumerate(
@@ -204,7 +203,8 @@ def _fill_mesh(
         )
     mesh = convex_mesh(obstacle.mesh)
     rotation[:] = numbers[:, 3:].reshape(-1, 3, 3)
-    center[:], size[:] = numbers[:, :3] + rotation @ mesh.center, mesh.half
+    center[:] = numbers[:, :3] + rotation @ mesh.center
+    size[:] = mesh.half
     return mesh
 
 
@@ -213,13 +213,15 @@ def _fill(
 ) -> None:
     """Fill in centers (N, 3), rotations (N, 3, 3), which are units, and sizes (N, 3), which are 0, of an obstacle."""
     if obstacle.upright:
-        x, y = obstacle.x or Range(0, 0), obstacle.y or Range(0, 0)
+        x = obstacle.x or Range(0, 0)
+        y = obstacle.y or Range(0, 0)
         height = obstacle.height or UNBOUNDED_OBSTACLE_HEIGHT_M
         center[:, :2] = (x.low + x.high) / 2, (y.low + y.high) / 2
         center[:, 2] = numbers[:, 0] - height / 2
         size[:] = (x.high - x.low) / 2, (y.high - y.low) / 2, height / 2
         return
-    center[:], rest = numbers[:, :3], numbers[:, 3:]
+    center[:] = numbers[:, :3]
+    rest = numbers[:, 3:]
     if obstacle.kind == "box":
         size[:] = rest[:, :3]
         if obstacle.is_turned:
@@ -271,7 +273,8 @@ def padded(scenes: Sequence[Primitives]) -> Primitives:
         # Codes of meshes are renumbered, since scenes have different lists of meshes.
         kinds[index, :count] = np.array([*range(MESH), *codes, NO_BODY])[scene.kinds]
         centers[index, :count] = scene.centers
-        rotations[index, :count], sizes[index, :count] = scene.rotations, scene.sizes
+        rotations[index, :count] = scene.rotations
+        sizes[index, :count] = scene.sizes
     return Primitives(kinds, centers, rotations, sizes, tuple(meshes))
 
 
@@ -290,11 +293,9 @@ def signed_distances(primitives: Primitives, points: Array) -> Array:
     """Compute the signed distances of P world points from M primitives [m], negative inside, shape (M, P)."""
     distances = np.empty((len(primitives), len(points)))
     for index in range(len(primitives)):
-        mesh, kind, size = (
-            primitives.mesh(index),
-            int(primitives.kinds[index]),
-            primitives.sizes[index],
-        )
+        mesh = primitives.mesh(index)
+        kind = int(primitives.kinds[index])
+        size = primitives.sizes[index]
         # Chunks of points whose temporary arrays fit the cache.
         for first in range(0, len(points), POINTS_PER_CHUNK):
             part = slice(first, first + POINTS_PER_CHUNK)
@@ -311,7 +312,8 @@ def _distance(kind: int, size: Array, local: Array) -> Array:
     """Return the signed distances of points in the frame of a primitive, shape (P,)."""
     if kind == 0:
         return _outside_or_inside(np.abs(local) - size)
-    radius, half = size[0], size[1]
+    radius = size[0]
+    half = size[1]
     if kind == 2:
         radial = np.hypot(local[:, 0], local[:, 1]) - radius
         return _outside_or_inside(

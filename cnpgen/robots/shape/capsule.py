@@ -127,11 +127,13 @@ def _along(axis: Array, corners: Array, thickness: Array) -> Array:
         # Towards the farthest point by 1 / (k + 1): converges to the center of the
         # smallest circle.
         center = center + away[np.argmax(np.hypot(*away.T) + thickness)] / (step + 1)
-    along, off = corners @ axis, np.hypot(*(projection - center).T)
+    along = corners @ axis
+    off = np.hypot(*(projection - center).T)
     # A ball at height h is covered by a cap whose end is within sqrt(R^2 - off^2) of
     # it, with R the radius that is left for its center.
     reach = np.sqrt(np.maximum(((off + thickness).max() - thickness) ** 2 - off**2, 0))
-    low, high = (along + reach).min(), (along - reach).max()
+    low = (along + reach).min()
+    high = (along - reach).max()
     low, high = (low, high) if low < high else ((low + high) / 2,) * 2
     return np.asarray(center @ across + np.outer([low, high], axis))
 
@@ -156,7 +158,8 @@ def _improved(
     Return its ends [m], shape (2, 3).
     """
     ends = np.array([start.first, start.second])
-    near, facets = np.zeros(0, np.intp), np.zeros(0, np.intp)
+    near = np.zeros(0, np.intp)
+    facets = np.zeros(0, np.intp)
     for _ in range(MAX_CAPSULE_ROUNDS):
         covered = _distances(corners, *ends)[0] + thickness
         excess = (ends @ normals.T - offsets).max(axis=0)

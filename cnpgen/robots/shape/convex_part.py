@@ -71,7 +71,8 @@ def link_convex_parts(urdf: str) -> list[ConvexPart]:
     A cylinder becomes a prism of ``PRISM_SIDES`` sides that contains it; all other
     geometry is exact.
     """
-    found, errors = list[ConvexPart](), list[str]()
+    found = list[ConvexPart]()
+    errors = list[str]()
     for link in urdf_tree(urdf).iter("link"):
         for element in link.iter("collision"):
             name = link.get("name", "")

@@ -117,7 +117,9 @@ def cut_parts(mesh: TriangleMesh, most: int) -> list[TriangleMesh]:
 
 
 def _best_cut(part: TriangleMesh) -> _Cut:
-    best, volume, points = _Cut(part), part.hull_volume, part.used_points
+    best = _Cut(part)
+    volume = part.hull_volume
+    points = part.used_points
     for axis in range(3):
         for position in _cut_positions(points[:, axis]):
             halves = cut_mesh(part, axis, float(position))
@@ -129,7 +131,8 @@ def _best_cut(part: TriangleMesh) -> _Cut:
 
 def _cut_positions(coordinates: Array) -> list[float]:
     """Return positions of planes: evenly between both ends, and those of most points, such as faces across the axis."""
-    low, high = float(coordinates.min()), float(coordinates.max())
+    low = float(coordinates.min())
+    high = float(coordinates.max())
     # Faces across the axis are natural cuts; evenly spaced planes find the others.
     even = np.linspace(low, high, CUTS_PER_AXIS + 2)[1:-1]
     faces, counts = np.unique(
@@ -165,8 +168,10 @@ def cut_mesh(
         * (mesh.points[end] - mesh.points[a])
         for end in (b, c)
     )
-    points, count = np.concatenate([mesh.points, on_ab, on_ac]), len(mesh.points)
-    ab, ac = count + np.arange(len(a)), count + len(a) + np.arange(len(a))
+    points = np.concatenate([mesh.points, on_ab, on_ac])
+    count = len(mesh.points)
+    ab = count + np.arange(len(a))
+    ac = count + len(a) + np.arange(len(a))
     tips = np.stack([a, ab, ac], axis=1)
     # The quadrilateral becomes two triangles.
     rests = np.concatenate(

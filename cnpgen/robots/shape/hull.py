@@ -86,8 +86,10 @@ def enclosing_hull(corners: Array) -> tuple[Array, float]:
     import coal
     from scipy.spatial import HalfspaceIntersection
 
-    center, extent = corners.mean(axis=0), np.ptp(corners, axis=0)
-    scaled, half = (corners - center) / extent, half_sphere(ENCLOSING_PLANES // 2)
+    center = corners.mean(axis=0)
+    extent = np.ptp(corners, axis=0)
+    scaled = (corners - center) / extent
+    half = half_sphere(ENCLOSING_PLANES // 2)
     normals = np.concatenate([half, -half])
     # Slightly outside, so that rounding does not cut a corner off.
     offsets = (normals @ scaled.T).max(axis=1) + 1e-9
@@ -95,12 +97,10 @@ def enclosing_hull(corners: Array) -> tuple[Array, float]:
         np.column_stack([normals, -offsets]), np.zeros(3)
     ).intersections
     body = hull_corners(found * extent + center)
-    hull, point, place, request = (
-        coal_hull(corners),
-        coal.Sphere(0.0),
-        coal.Transform3s(),
-        coal.DistanceRequest(),
-    )
+    hull = coal_hull(corners)
+    point = coal.Sphere(0.0)
+    place = coal.Transform3s()
+    request = coal.DistanceRequest()
     distances = []
     for corner in body:
         place.setTranslation(corner)
@@ -116,7 +116,8 @@ def half_sphere(count: int) -> Array:
     """Return unit vectors on a Fibonacci lattice over the upper half of the sphere, shape (count, 3)."""
     # Equal areas: heights are equidistant and longitudes differ by the golden angle.
     z = (np.arange(count) + 0.5) / count
-    angle, level = np.arange(count) * np.pi * (3 - np.sqrt(5)), np.sqrt(1 - z**2)
+    angle = np.arange(count) * np.pi * (3 - np.sqrt(5))
+    level = np.sqrt(1 - z**2)
     return np.stack([level * np.cos(angle), level * np.sin(angle), z], axis=1)
 
 
@@ -173,7 +174,8 @@ def coal_vectors(points: Array, triangles: Iterable[Any]) -> tuple[Any, Any]:
     """Return points [m], shape (V, 3), and triangles, indices of points, as vectors of Coal."""
     import coal
 
-    corners, sides = coal.StdVec_Vec3s(), coal.StdVec_Triangle()
+    corners = coal.StdVec_Vec3s()
+    sides = coal.StdVec_Triangle()
     for point in points:
         corners.append(point)
     for triangle in triangles:
@@ -185,7 +187,9 @@ def frame_along(vector: Sequence[float], length: float) -> Array:
     """Return a rotation matrix whose third column is a vector's direction (Duff et al. 2017, JCGT 6(1))."""
     if length == 0.0:
         return np.eye(3)
-    x, y, z = vector[0] / length, vector[1] / length, vector[2] / length
+    x = vector[0] / length
+    y = vector[1] / length
+    z = vector[2] / length
     # Without a branch at z = -1: the sign of z selects one of two charts.
     sign = math.copysign(1.0, z)
     a = -1.0 / (sign + z)

@@ -129,11 +129,13 @@ def joint_poses(model: "pin.Model", states: Array) -> tuple[Array, Array]:
     """Return rotations, shape (joints, K, 3, 3), and positions [m], shape (joints, K, 3), of all joints at K states."""
     import pinocchio as pin
 
-    data, poses = model.createData(), np.empty((model.njoints, len(states), 4, 3))
+    data = model.createData()
+    poses = np.empty((model.njoints, len(states), 4, 3))
     for k, q in enumerate(states):
         pin.forwardKinematics(model, data, q)
         for joint, pose in enumerate(data.oMi):
-            poses[joint, k, :3], poses[joint, k, 3] = pose.rotation, pose.translation
+            poses[joint, k, :3] = pose.rotation
+            poses[joint, k, 3] = pose.translation
     return poses[:, :, :3], poses[:, :, 3]
 
 
@@ -184,10 +186,8 @@ class LinkContact:
         self._of_link: dict[str, list[CollisionBody]] = {}
         for link, body in bodies:
             self._of_link.setdefault(link, []).append(body)
-        self._request, self._places = (
-            coal.CollisionRequest(),
-            (coal.Transform3s(), coal.Transform3s()),
-        )
+        self._request = coal.CollisionRequest()
+        self._places = (coal.Transform3s(), coal.Transform3s())
 
     def of(self, first: str, second: str, *, among: Mask | None = None) -> Mask:
         """Return a mask of the states, among all or those of a mask, in which two links overlap, shape (K,)."""
@@ -247,7 +247,9 @@ def segment_distances(a: Array, b: Array, c: Array, d: Array) -> Array:
     The closest points of the lines are clamped to one segment after the other (Ericson
     2005, section 5.1.9).
     """
-    one, other, between = b - a, d - c, a - c
+    one = b - a
+    other = d - c
+    between = a - c
     aa, bb, ab = (
         np.einsum("ki,ki->k", x, y)
         for x, y in ((one, one), (other, other), (one, other))

@@ -81,7 +81,8 @@ def _places(name: str, beside: Path, packages: Sequence[Path]) -> Iterator[Path]
     """List the candidate paths of a referenced file, the most likely first."""
     parts = urlparse(name)
     if parts.scheme in _PACKAGE:
-        package, rest = unquote(parts.netloc), unquote(parts.path).lstrip("/")
+        package = unquote(parts.netloc)
+        rest = unquote(parts.path).lstrip("/")
         for folder in (
             *packages,
             *_of_environment(),

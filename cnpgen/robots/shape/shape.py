@@ -111,7 +111,8 @@ def load_shape(urdf: str, model: "pin.Model", keep: Path | None) -> Shape:
             covering_capsule(_parts_of(link, convex_parts)) for link in joints
         )
         by_link = {capsule.link: capsule for capsule in capsules}
-        adjacent, disabled = _adjacent(urdf, set(joints)), disabled_pairs(urdf)
+        adjacent = _adjacent(urdf, set(joints))
+        disabled = disabled_pairs(urdf)
         return capsules, find_pairs(
             model,
             convex_parts,
@@ -167,7 +168,8 @@ def _parts_of(link: str, convex_parts: Parts) -> list[ConvexPart]:
 
 def place_convex_parts(urdf: str, model: "pin.Model") -> tuple[Parts, dict[str, int]]:
     """Return the convex parts of links in the frames of the joints that move them, and link -> index of this joint."""
-    placed, joints = [], {}
+    placed = []
+    joints = {}
     for part in link_convex_parts(urdf):
         frame = model.frames[frame_of(model, part.link)]
         placed.append(
@@ -184,7 +186,8 @@ def _adjacent(urdf: str, shaped: set[str]) -> frozenset[frozenset[str]]:
     """Return the pairs of a link and its nearest ancestor with a shape."""
     parents = {}
     for joint in urdf_tree(urdf).iter("joint"):
-        parent, child = joint.find("parent"), joint.find("child")
+        parent = joint.find("parent")
+        child = joint.find("child")
         if parent is not None and child is not None:
             parents[child.get("link", "")] = parent.get("link", "")
     found = set()
@@ -245,7 +248,8 @@ def load_held_shape(
             text = f"no link {link!r} has collision geometry{nearest(link, joints)}"
             raise RecipeError([f"object.touch_links: {text}"])
     tip = model.frames[tip_frame]
-    carrier, pose = int(tip.parentJoint), tip.placement
+    carrier = int(tip.parentJoint)
+    pose = tip.placement
     moving = (link for link in joints if joints[link] != carrier)
     checked = [link for link in moving if link not in held.touch_links]
     box = _box(held.size, np.array(pose.rotation), np.array(pose.translation))
@@ -275,17 +279,13 @@ def with_held_object(
     The tip of the chain is its center. Pairs of the held shape are added; None for no
     pairs with the object.
     """
-    box, half = (
-        _box(size, chain.tip_rotation, chain.tip_translation),
-        np.array(size) / 2,
-    )
+    box = _box(size, chain.tip_rotation, chain.tip_translation)
+    half = np.array(size) / 2
     # The capsule along the longest edge has the smallest radius: half the diagonal
     # across.
     widest = int(np.argmax(half))
-    axis, radius = (
-        half[widest] * chain.tip_rotation[:, widest],
-        float(np.linalg.norm(np.delete(half, widest))),
-    )
+    axis = half[widest] * chain.tip_rotation[:, widest]
+    radius = float(np.linalg.norm(np.delete(half, widest)))
     capsule = Capsule(
         HELD_OBJECT,
         chain.tip_translation - axis,

@@ -63,7 +63,9 @@ class Account:
         allow_unused: Sequence[str] = (),
         error: type[UsageError] = UsageError,
     ) -> None:
-        self.place, self.known, self.error = place, known, error
+        self.place = place
+        self.known = known
+        self.error = error
         self._allowed = tuple(allow_unused)
         self.unused: list[str] = []
         self.accepted: list[str] = []
@@ -158,7 +160,8 @@ class AccountedMapping(dict[str, Any]):
             (key, _wrapped(value, f"{path}.{key}" if path else str(key), account))
             for key, value in values.items()
         )
-        self.path, self.account = path, account
+        self.path = path
+        self.account = account
         account.keys.update(self)
         # Also keys that the mapping lacks.
         self._read: set[str] = set()

@@ -19,7 +19,8 @@ from pathlib import Path
 from cnpgen.errors import MachineError
 from cnpgen.store.files.file_lock import try_lock, unlock
 
-LIBRARIES, TAPES = "lib", "tape"
+LIBRARIES = "lib"
+TAPES = "tape"
 # In a temporary folder: a link to a cache that is readable but not writable.
 _READ_ONLY_LINK = "warm"
 _WRITABLE_FOR_OTHERS = stat.S_IWGRP | stat.S_IWOTH

@@ -96,7 +96,8 @@ def _check_checksum(
     path: Path, block: bytes, digest: str, *, kind: str, version: int
 ) -> None:
     """Raise an error if the header is not that of a kind and version with this sha256 of the rest of the file."""
-    head, expected = _CHECKSUM.match(block), kind_name(kind.removeprefix("cnpgen-"))
+    head = _CHECKSUM.match(block)
+    expected = kind_name(kind.removeprefix("cnpgen-"))
     if head is None and not _HEADER_PART.search(block):
         raise DatasetError(
             f"{path} is not {expected}, or its beginning is damaged{apparent_kind(path)}"

@@ -60,7 +60,8 @@ def create_hdf5(buffer: io.BytesIO, *, userblock: int = 0, alignment: int = 64) 
     """
     from h5py import h5f, h5fd, h5p
 
-    creation, access = h5p.create(h5p.FILE_CREATE), h5p.create(h5p.FILE_ACCESS)
+    creation = h5p.create(h5p.FILE_CREATE)
+    access = h5p.create(h5p.FILE_ACCESS)
     creation.set_userblock(userblock)
     # Times in the file would make equal contents differ.
     creation.set_obj_track_times(False)
@@ -102,8 +103,10 @@ class Attributes:
         from h5py import AttributeManager, h5a, h5s, h5t
 
         attribute = h5a.open(self._item, name.encode())
-        kind, space = attribute.get_type(), attribute.get_space()
-        text, count = kind.get_class() == h5t.STRING, space.get_simple_extent_npoints()
+        kind = attribute.get_type()
+        space = attribute.get_space()
+        text = kind.get_class() == h5t.STRING
+        count = space.get_simple_extent_npoints()
         scalar = space.get_simple_extent_type() == h5s.SCALAR
         plain = (
             scalar
@@ -321,7 +324,8 @@ def _check_texts(path: Path, what: str, item: Any) -> None:
     """Check that an attribute or a dataset has texts, at most one dimension, and a possible size."""
     from h5py import h5t
 
-    kind, space = item.get_type(), item.get_space()
+    kind = item.get_type()
+    space = item.get_space()
     count = space.get_simple_extent_npoints()
     if kind.get_class() != h5t.STRING or space.get_simple_extent_ndims() > 1:
         raise DatasetError(f"{path}: {what} must be a list of texts")

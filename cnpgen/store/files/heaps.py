@@ -34,7 +34,8 @@ def check_heaps(path: Path, file: BinaryIO) -> int:
 
 def _collections(file: BinaryIO) -> tuple[list[int], int]:
     """Return the positions of all collections in a file, and the size of the file [bytes]."""
-    begins, size = list[int](), 0
+    begins = list[int]()
+    size = 0
     buffer = bytearray(min(_CHUNK_BYTES, 8 * (file.seek(0, os.SEEK_END) // 8 + 1)))
     file.seek(0)
     while count := file.readinto(buffer):  # type: ignore[attr-defined]

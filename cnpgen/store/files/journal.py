@@ -107,7 +107,8 @@ def _recover(path: Path, file: IO[bytes], magic: bytes) -> JournalFile:
 
 def _read_records(file: IO[bytes]) -> list[bytes]:
     """Return the valid records from the current position, and seek to their end."""
-    records, end = [], file.tell()
+    records = []
+    end = file.tell()
     header_bytes = _LENGTH_BYTES + _DIGEST_BYTES
     while len(header := file.read(header_bytes)) == header_bytes:
         record = file.read(

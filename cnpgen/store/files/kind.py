@@ -45,7 +45,8 @@ def is_hdf5(path: Path) -> bool:
 def apparent_kind(path: Path) -> str:
     """Return the apparent kind of a file as the end of a message, ": it seems to be a text file"; otherwise empty."""
     try:
-        kind, size = kind_of_content(path), path.stat().st_size
+        kind = kind_of_content(path)
+        size = path.stat().st_size
     except OSError:
         return ""
     return (f": it seems to be {kind}" if kind else "") if size else ": it is empty"

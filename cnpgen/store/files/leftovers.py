@@ -82,5 +82,6 @@ def _machine() -> str:
         boot = Path("/proc/sys/kernel/random/boot_id").read_text(encoding="ascii")
         namespace = str(Path("/proc/self/ns/pid").stat().st_ino)
     except OSError:  # no Linux
-        boot, namespace = platform.node(), str(uuid.getnode())
+        boot = platform.node()
+        namespace = str(uuid.getnode())
     return hashlib.sha256(f"{boot} {namespace}".encode()).hexdigest()[:12]

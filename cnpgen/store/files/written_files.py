@@ -34,7 +34,8 @@ def claim_files(
         UsageError: There are matching files of other origin; they are named.
         MachineError: A file cannot be written or removed.
     """
-    planned, earlier = set(names), _listed(folder)
+    planned = set(names)
+    earlier = _listed(folder)
     # A file that the user edited is the user's.
     own = {name for name in earlier if _is_unchanged(folder / name, earlier[name])}
     if not force:

@@ -85,7 +85,9 @@ class _Follower:
     """Joint motion that follows a path in the plane."""
 
     def __init__(self, robot: Robot, task: Plans, settings: AQP) -> None:
-        self._robot, self._boundary, self._settings = robot, task.boundary, settings
+        self._robot = robot
+        self._boundary = task.boundary
+        self._settings = settings
         self._tip = Tip(robot)
         self._goal = task.columns["goal_xyz"][0]
         self._weights = np.array(JOINT_WEIGHTS[: robot.n])
@@ -200,7 +202,8 @@ def nearest_in_null_space(
     import daqp
 
     weighted = weights[:, None] * null
-    hessian, gradient = null.T @ weighted, weighted.T @ ahead
+    hessian = null.T @ weighted
+    gradient = weighted.T @ ahead
     # DAQP bounds the rows N a, of which there is one for each joint.
     low, high = (np.ascontiguousarray(bound) for bound in bounds)
     if np.any(low > high):
@@ -244,7 +247,8 @@ class PlanePath:
 
     def sampled(self, period: float) -> Iterator[Array]:
         """Yield the positions at every period after the start, the last one at the end or within a period of it."""
-        duration, length = self.duration, self.length
+        duration = self.duration
+        length = self.length
         for k in range(1, round(duration / period + 0.499) + 1):
             t = min(k * period, duration)
             # s(t) = v t^2 / (2 T) from rest, and v (t - t^2 / (2 T)) to rest.
@@ -275,7 +279,8 @@ class PlanePath:
         )
 
     def _lines(self) -> tuple[float, float]:
-        before, after = self.bend - self.start, self.end - self.bend
+        before = self.bend - self.start
+        after = self.end - self.bend
         return float(np.linalg.norm(before)), float(np.linalg.norm(after))
 
     def _directions(self) -> tuple[Array, Array]:
@@ -301,10 +306,8 @@ def striking_path(
     Positions [m] and the direction have shape (2,). The speed [m/s] is reduced if it
     needs more than the largest acceleration along the path [m/s^2].
     """
-    start, hit = (
-        np.clip(start, MIN_MALLET_XY_M, MAX_MALLET_XY_M),
-        np.clip(hit, MIN_MALLET_XY_M, MAX_MALLET_XY_M),
-    )
+    start = np.clip(start, MIN_MALLET_XY_M, MAX_MALLET_XY_M)
+    hit = np.clip(hit, MIN_MALLET_XY_M, MAX_MALLET_XY_M)
     low = np.array([min(start[0], hit[0]), MIN_MALLET_XY_M[1]])
     high = np.array([max(start[0], hit[0]), MAX_MALLET_XY_M[1]])
     path = PlanePath(start, _exit_point(hit, -velocity, low, high), hit, speed)
@@ -318,7 +321,8 @@ def stopping_path(hit_path: PlanePath) -> PlanePath:
     hit = hit_path.end
     aside = STOP_OFFSET_M * np.array([1.0, -1.0 if hit[1] > 0 else 1.0])
     end = np.clip(hit + aside, [-np.inf, -MAX_STOP_XY_M[1]], MAX_STOP_XY_M)
-    low, high = np.minimum(hit, end), np.maximum(hit, end)
+    low = np.minimum(hit, end)
+    high = np.maximum(hit, end)
     bends = bool((hit != hit_path.bend).any())
     forwards = hit - (hit_path.bend if bends else hit_path.start)
     return PlanePath(

@@ -91,7 +91,8 @@ def seed_ompl(ompl: Any, setting: Setting, task: Plans) -> None:
 
 def joint_space(base: Any, robot: Robot) -> Any:
     """Return OMPL's space of joint positions within the limits of a robot."""
-    space, bounds = base.RealVectorStateSpace(robot.n), base.RealVectorBounds(robot.n)
+    space = base.RealVectorStateSpace(robot.n)
+    bounds = base.RealVectorBounds(robot.n)
     for index, (low, high) in enumerate(
         zip(robot.position_lower.tolist(), robot.position_upper.tolist(), strict=True)
     ):
@@ -116,10 +117,8 @@ class PathSearch(ABC):
     max_goal_error = float(np.finfo(float).eps)  # rad
 
     def __init__(self, robot: Robot, task: Plans) -> None:
-        self._robot, self._ends = (
-            robot,
-            (task.boundary.start_q[0], task.boundary.goal_q[0]),
-        )
+        self._robot = robot
+        self._ends = (task.boundary.start_q[0], task.boundary.goal_q[0])
 
     @abstractmethod
     def is_valid(self, q: Array) -> bool:
@@ -144,10 +143,8 @@ class PathSearch(ABC):
         OMPL.
         """
         information, ends = self.space(ompl)
-        setup, planner = (
-            ompl.geometric.SimpleSetup(information),
-            ompl.geometric.RRTConnect(information),
-        )
+        setup = ompl.geometric.SimpleSetup(information)
+        planner = ompl.geometric.RRTConnect(information)
         joints = range(self._robot.n)
         setup.setStateValidityChecker(
             lambda state: self.is_valid(np.array([state[index] for index in joints]))
@@ -180,7 +177,9 @@ class Search(PathSearch):
         self, problem: Problem, robot: Robot, task: Plans, delta: float = 0.05
     ) -> None:
         super().__init__(robot, task)
-        self._tip, self._data, self._delta = Tip(robot), robot.model.createData(), delta
+        self._tip = Tip(robot)
+        self._data = robot.model.createData()
+        self._delta = delta
         self._table = problem.first(Table)
         if self._table is None:
             self._size, self._boxes = boxes_of(problem, task.scene)
@@ -200,7 +199,8 @@ class Search(PathSearch):
 
         position, rotation, _ = self._tip.at(q)
         if self._table is not None:
-            x, y = self._table.x, self._table.y
+            x = self._table.x
+            y = self._table.y
             return bool(
                 x.low <= position[0] <= x.high and y.low <= position[1] <= y.high
             )

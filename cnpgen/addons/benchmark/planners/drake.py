@@ -36,7 +36,8 @@ from cnpgen.trajectory.boundary import Boundary
 
 SPLINE_ORDER = 4  # cubic, the default of Drake
 MIN_KNOT_DISTANCE_S = 1e-9  # closer knots are one
-MIN_DURATION_S, MAX_DURATION_S = 0.05, 20.0
+MIN_DRAKE_DURATION_S = 0.05
+MAX_DRAKE_DURATION_S = 20.0
 # Half of the verdict's tolerance, because samples lie between those of the program.
 MAX_SAMPLED_HEIGHT_ERROR_M = 5e-4
 MAX_PLANE_TILT_RAD = 0.01
@@ -79,10 +80,8 @@ class Drake(BenchmarkPlanner):
 
     def _plan(self, problem: Problem, robot: Robot, task: Plans) -> Trajectory | None:
         """Solve both programs; return None if the second one has no solution."""
-        arm, samples = (
-            DrakeArm(problem, robot, task.scene),
-            np.linspace(0, 1, self.samples),
-        )
+        arm = DrakeArm(problem, robot, task.scene)
+        samples = np.linspace(0, 1, self.samples)
         free = self._program(problem, robot, task.boundary)
         program = self._program(problem, robot, task.boundary)
         program.SetInitialGuess(free.ReconstructTrajectory(self._solve(free)))
@@ -100,7 +99,8 @@ class Drake(BenchmarkPlanner):
     def _solve(self, program: Any) -> Any:
         from pydrake.solvers import SnoptSolver, Solve, SolverOptions
 
-        options, solver = SolverOptions(), SnoptSolver.id()
+        options = SolverOptions()
+        solver = SnoptSolver.id()
         options.SetOption(
             solver, "Major optimality tolerance", self.optimality_tolerance
         )
@@ -116,7 +116,7 @@ class Drake(BenchmarkPlanner):
         )
         program.AddDurationCost(1.0)
         program.AddPathLengthCost(self.path_length_weight)
-        program.AddDurationConstraint(MIN_DURATION_S, MAX_DURATION_S)
+        program.AddDurationConstraint(MIN_DRAKE_DURATION_S, MAX_DRAKE_DURATION_S)
         program.AddPositionBounds(robot.position_lower, robot.position_upper)
         program.AddVelocityBounds(-robot.velocity_limit, robot.velocity_limit)
         program.AddAccelerationBounds(
@@ -132,7 +132,7 @@ class Drake(BenchmarkPlanner):
             2 * distance / robot.velocity_limit,
             np.sqrt(6 * distance / robot.acceleration_limit),
         )
-        duration = np.clip(np.max(times), MIN_DURATION_S, MAX_DURATION_S)
+        duration = np.clip(np.max(times), MIN_DRAKE_DURATION_S, MAX_DRAKE_DURATION_S)
         line = np.linspace(
             boundary.start_q[0], boundary.goal_q[0], self.control_points
         ).T
@@ -149,7 +149,8 @@ def add_boundary_conditions(program: Any, boundary: Boundary) -> None:
     from pydrake.solvers import Binding, LinearConstraint
     from pydrake.trajectories import BsplineTrajectory
 
-    n, still = boundary.start_q.shape[1], not np.any(boundary.goal_dq)
+    n = boundary.start_q.shape[1]
+    still = not np.any(boundary.goal_dq)
     for s, q, dq in (
         (0.0, boundary.start_q[0], boundary.start_dq[0]),
         (1.0, boundary.goal_q[0], boundary.goal_dq[0]),
@@ -161,7 +162,8 @@ def add_boundary_conditions(program: Any, boundary: Boundary) -> None:
         )
     if still:
         program.AddPathAccelerationConstraint(np.zeros(n), np.zeros(n), 1.0)
-    points, duration = program.control_points(), program.duration()
+    points = program.control_points()
+    duration = program.duration()
     units = [np.eye(points.shape[1])[:, [index]] for index in range(points.shape[1])]
     # Weights of the control points.
     second = BsplineTrajectory(program.basis(), units).EvalDerivative(0.0, 2)[:, 0]
@@ -208,7 +210,8 @@ class DrakeArm:
         from pydrake.multibody.plant import AddMultibodyPlantSceneGraph
         from pydrake.systems.framework import DiagramBuilder
 
-        self._problem, self._robot = problem, robot
+        self._problem = problem
+        self._robot = robot
         builder = DiagramBuilder()
         self._plant, self._scene_graph = AddMultibodyPlantSceneGraph(
             builder, time_step=0.0
@@ -235,16 +238,15 @@ class DrakeArm:
         from pydrake.math import RigidTransform
         from pydrake.multibody.plant import CoulombFriction
 
-        plant, friction = self._plant, CoulombFriction()
+        plant = self._plant
+        friction = CoulombFriction()
         held = plant.GetFrameByName(self._robot.tip).body()
         plant.RegisterCollisionGeometry(
             held, RigidTransform(), Box(*size), "held", friction
         )
         for index, solid in enumerate(scene.bodies()):
-            place, edges = (
-                RigidTransform((solid.low + solid.high) / 2),
-                solid.high - solid.low,
-            )
+            place = RigidTransform((solid.low + solid.high) / 2)
+            edges = solid.high - solid.low
             plant.RegisterCollisionGeometry(
                 plant.world_body(), place, Box(*edges), f"obstacle {index}", friction
             )
@@ -257,13 +259,12 @@ class DrakeArm:
             PositionConstraint,
         )
 
-        plant, table = self._plant, self._problem.first(Table)
+        plant = self._plant
+        table = self._problem.first(Table)
         context = plant.GetMyMutableContextFromRoot(self._context)
-        tip, world, up = (
-            plant.GetFrameByName(self._robot.tip),
-            plant.world_frame(),
-            np.array([0.0, 0.0, 1.0]),
-        )
+        tip = plant.GetFrameByName(self._robot.tip)
+        world = plant.world_frame()
+        up = np.array([0.0, 0.0, 1.0])
         if table is not None:
             low = np.array(
                 [table.x.low, table.y.low, table.z - MAX_SAMPLED_HEIGHT_ERROR_M]

@@ -108,25 +108,25 @@ class ProposedExtension:
 
     def __call__(self) -> int:
         """Take one step; return the new node, or 0 after a failure."""
-        state, target, random = (
-            self.tree.state(self.node),
-            self.goal_q,
-            self.steer.random,
-        )
+        state = self.tree.state(self.node)
+        target = self.goal_q
+        random = self.steer.random
         if random.random() >= self.steer.settings.goal_bias:
             target = self.network.propose(
                 state, self.goal_q, self.steer.obstacle_poses, random
             )
         motion = self.steer(state, target)
         node = 0 if motion is None else self.tree.add(self.node, *motion)
-        self.node, self.steps = node, self.steps + 1
+        self.node = node
+        self.steps = self.steps + 1
         # After a failure or many steps, the search goes on at a node near a random
         # position.
         if motion is None or self.steps > MAX_CONSECUTIVE_STEPS:
             position = self.steer.check.random_position(
                 self.steer.obstacle_poses, random
             )
-            self.node, self.steps = self.tree.select(position), 0
+            self.node = self.tree.select(position)
+            self.steps = 0
         return node
 
 
@@ -180,7 +180,8 @@ class Steering:
         """
         mean = np.append(np.zeros_like(self.limit), self.spread.mean_time)
         deviation = np.append(self.spread.acceleration * self.limit, self.spread.time)
-        best, least = None, np.inf
+        best = None
+        least = np.inf
         for _ in range(self.settings.iterations):
             controls = self._sample_controls(mean, deviation)
             paths, tips, lengths = self.integrate(state, controls)
@@ -190,12 +191,11 @@ class Steering:
                 lengths > 0, np.linalg.norm(ends - target, axis=1), np.inf
             )
             order = np.argsort(distances)[: self.settings.elites]
-            first, length = int(order[0]), int(lengths[order[0]])
+            first = int(order[0])
+            length = int(lengths[order[0]])
             if distances[first] < least:
-                best, least = (
-                    (paths[first, :length], tips[first, length - 1]),
-                    float(distances[first]),
-                )
+                best = (paths[first, :length], tips[first, length - 1])
+                least = float(distances[first])
             elites = controls[order[np.isfinite(distances[order])]]
             if least < TARGET_TOLERANCE_RAD or not len(elites):
                 break
@@ -213,10 +213,8 @@ class Steering:
         controls = self.random.normal(
             mean, deviation, (self.settings.samples, len(mean))
         )
-        low, high = (
-            np.append(-self.limit, STEERING_STEP_S),
-            np.append(self.limit, self.spread.max_duration),
-        )
+        low = np.append(-self.limit, STEERING_STEP_S)
+        high = np.append(self.limit, self.spread.max_duration)
         return np.clip(controls, low, high)
 
     def integrate(

@@ -34,7 +34,8 @@ class Solve(BenchmarkPlanner):
 def near_base(record: ProblemRecord) -> Plans:
     """Return a boundary problem for warming up: a small rotation of the first joint from the base configuration."""
     base = open_problem(record)[1].home
-    goal, still = base.copy(), np.zeros((1, len(base)))
+    goal = base.copy()
+    still = np.zeros((1, len(base)))
     goal[0] += 0.1
     ends = {"start_q": base[None], "goal_q": goal[None]}
     return plans_of_rows(
@@ -110,6 +111,7 @@ def _batch_of_one(planner: Planner) -> Callable[[Plans], Plans]:
             problem.boundary, sample_id=problem.sample_id, columns=problem.columns
         )
 
-    base, nominal = planner.robot.home, planner.robot.nominal_parameters
+    base = planner.robot.home
+    nominal = planner.robot.nominal_parameters
     planner.plan(base, base, parameters=nominal if len(nominal) else None)
     return plan

@@ -52,7 +52,8 @@ class Radii:
 
 
 HIT_SELECT_M, HIT_GOAL_M = 0.05, 0.02  # the paper's radii
-TRANSPORT_SELECT_M, TRANSPORT_GOAL_M = 0.2, 0.2
+TRANSPORT_SELECT_M = 0.2
+TRANSPORT_GOAL_M = 0.2
 
 
 def radii_of(problem: Problem, witness: float) -> Radii:
@@ -74,10 +75,14 @@ class Tree:
     """
 
     def __init__(self, start: Array, tip: Array, radii: Radii, step: float) -> None:
-        self._radii, self._step = radii, step
-        self._paths, self._parents = [start[None]], [-1]
-        self._tips, self._cost = _GrowingArray((3,)), _GrowingArray(())
-        self._witnesses, self._holders = _GrowingArray((3,)), _GrowingArray(())
+        self._radii = radii
+        self._step = step
+        self._paths = [start[None]]
+        self._parents = [-1]
+        self._tips = _GrowingArray((3,))
+        self._cost = _GrowingArray(())
+        self._witnesses = _GrowingArray((3,))
+        self._holders = _GrowingArray(())
         for rows, row in (
             (self._tips, tip),
             (self._cost, 0.0),
@@ -112,7 +117,8 @@ class Tree:
         Return the active node near the witness: the new one or the cheaper one.
         """
         # The cost is time: a step for each state of the path.
-        node, cost = len(self._paths), self._cost.rows[parent] + self._step * len(path)
+        node = len(self._paths)
+        cost = self._cost.rows[parent] + self._step * len(path)
         distances = np.linalg.norm(self._witnesses.rows - tip, axis=1)
         witness = int(np.argmin(distances))
         if distances[witness] >= self._radii.witness:
@@ -156,20 +162,23 @@ class Tree:
         it is the root, node 0.
         """
         deadline = perf_counter() + time_limit
-        best, min_distance = 0, float(np.linalg.norm(self.tip(0) - goal))
+        best = 0
+        min_distance = float(np.linalg.norm(self.tip(0) - goal))
         for _ in range(max_iterations):
             if min_distance <= self._radii.goal or perf_counter() > deadline:
                 break
             node = extend()
             distance = float(np.linalg.norm(self.tip(node) - goal))
             if distance < min_distance:
-                best, min_distance = node, distance
+                best = node
+                min_distance = distance
         return self.path_to(best) if best else None
 
 
 def tree_of(problem: Problem, task: Plans, witness_radius: float, step: float) -> Tree:
     """Return the tree of a boundary problem with its root, the start; see ``radii_of``."""
-    boundary, tip = task.boundary, task.columns["start_xyz"][0]
+    boundary = task.boundary
+    tip = task.columns["start_xyz"][0]
     start = np.concatenate([boundary.start_q[0], boundary.start_dq[0]])
     return Tree(start, tip, radii_of(problem, witness_radius), step)
 
@@ -178,7 +187,8 @@ class _GrowingArray:
     """Array to which rows are appended."""
 
     def __init__(self, shape: tuple[int, ...]) -> None:
-        self._all, self._count = np.empty((1024, *shape)), 0
+        self._all = np.empty((1024, *shape))
+        self._count = 0
 
     @property
     def rows(self) -> Array:
@@ -265,7 +275,8 @@ class SST(BenchmarkPlanner):
             * np.arange(1.0, random.integers(1, self.max_steps + 1) + 1)[:, None]
         )
         # Constant acceleration: q + dq t + ddq t^2 / 2.
-        path_q, path_dq = q + t * (dq + t / 2 * ddq), dq + t * ddq
+        path_q = q + t * (dq + t / 2 * ddq)
+        path_dq = dq + t * ddq
         tips, valid = check(
             path_q, path_dq, np.broadcast_to(ddq, path_q.shape), obstacle_poses
         )

@@ -66,7 +66,8 @@ def tip_and_violation(robot: Robot, problem: Problem) -> Any:
     columns, state = SymbolicState.of_symbols(
         robot, problem.obstacle, problem.object_size, problem.scene_width
     )
-    tip, table = state.kinematics.tip, problem.first(Table)
+    tip = state.kinematics.tip
+    table = problem.first(Table)
     violation = [
         ca.fabs(value) - limit
         for value, limit in zip(state.dq, robot.velocity_limit.tolist(), strict=True)
@@ -110,7 +111,8 @@ def _obstacle_violations(state: SymbolicState) -> list[Scalar]:
     """Return violations of the tilt, of the distance to the obstacles, and of the penetration of corners."""
     import casadi as ca
 
-    rotation, tip = state.kinematics.rotation, state.kinematics.tip
+    rotation = state.kinematics.rotation
+    tip = state.kinematics.tip
     corners = [
         [x + dot(row, corner) for x, row in zip(tip, rotation, strict=True)]
         for corner in (CUBE * np.array(state.object_size)).tolist()

@@ -86,7 +86,9 @@ class TrajOptTranscription:
     def __init__(
         self, robot: Robot, boundary: Boundary, at_knots: KnotConstraints
     ) -> None:
-        self._robot, self._boundary, self._at_knots = robot, boundary, at_knots
+        self._robot = robot
+        self._boundary = boundary
+        self._at_knots = at_knots
         inner = KNOTS - 2
         moving = bool(np.any(boundary.goal_dq))
         self._free_ddq = slice(0, KNOTS) if moving else slice(1, KNOTS - 1)
@@ -122,7 +124,8 @@ class TrajOptTranscription:
 
     def unpack(self, x: Array) -> tuple[Array, Array, Array, float]:
         """Return positions, velocities and accelerations at all knots, shape (KNOTS, n) each, and T."""
-        n, b = self._robot.n, self._boundary
+        n = self._robot.n
+        b = self._boundary
         q, dq, free = (part.reshape(-1, n) for part in np.split(x[:-1], self._ends[:2]))
         ddq = np.zeros((KNOTS, n))
         ddq[self._free_ddq] = free
@@ -146,7 +149,8 @@ class TrajOptTranscription:
         )
         s = np.linspace(0, 1, KNOTS)
         shape = np.polynomial.Polynomial
-        up, down = shape([0, 1]), shape([1, -1])
+        up = shape([0, 1])
+        down = shape([1, -1])
         basis = [down**3, down**2 * up, down * up**2, up**3]
         q, dq, ddq = (
             np.array([polynomial.deriv(order)(s) for polynomial in basis]).T @ a
@@ -169,7 +173,8 @@ class TrajOptTranscription:
 
     def bounds(self) -> tuple[Array, Array]:
         """Return the lower and upper bounds of the variables."""
-        robot, inner = self._robot, KNOTS - 2
+        robot = self._robot
+        inner = KNOTS - 2
         free = self._free_ddq.stop - self._free_ddq.start
         high = [
             np.tile(robot.position_upper, inner),
@@ -201,21 +206,25 @@ class TrajOptTranscription:
 
     def defects_jacobian(self, x: Array) -> Array:
         """Return the derivative of ``defects``."""
-        n, inner = self._robot.n, KNOTS - 2
+        n = self._robot.n
+        inner = KNOTS - 2
         _, dq, ddq, duration = self.unpack(x)
-        step, rows = duration / KNOTS, (KNOTS - 1) * n
+        step = duration / KNOTS
+        rows = (KNOTS - 1) * n
         # Of consecutive knots, in the inner ones.
         differences = np.eye(KNOTS)[1:, 1:-1] - np.eye(KNOTS)[:-1, 1:-1]
         selection = np.eye(KNOTS)[:-1]
         unit = np.eye(n)
         J = np.zeros((2 * rows, self._size))
-        first, second = slice(0, inner * n), slice(inner * n, 2 * inner * n)
+        first = slice(0, inner * n)
+        second = slice(inner * n, 2 * inner * n)
         J[:rows, first] = np.kron(differences, unit)
         # Defects q_k+1 - q_k - h dq_k have the derivatives +1, -1 and -h.
         J[:rows, second] = -step * np.kron(selection[:, 1:-1], unit)
         J[rows:, second] = np.kron(differences, unit)
         J[rows:, second.stop : -1] = -step * np.kron(selection[:, self._free_ddq], unit)
-        J[:rows, -1], J[rows:, -1] = -dq[:-1].ravel() / KNOTS, -ddq[:-1].ravel() / KNOTS
+        J[:rows, -1] = -dq[:-1].ravel() / KNOTS
+        J[rows:, -1] = -ddq[:-1].ravel() / KNOTS
         return J
 
     def margins(self, x: Array) -> Array:
@@ -224,7 +233,8 @@ class TrajOptTranscription:
 
     def margins_jacobian(self, x: Array) -> Array:
         """Return the derivative of ``margins``."""
-        n, inner = self._robot.n, KNOTS - 2
+        n = self._robot.n
+        inner = KNOTS - 2
         g, derivatives = self._at_knots(*self._inner(x))
         rows = g.shape[1]
         J = np.zeros((inner, rows, self._size))
@@ -285,14 +295,17 @@ def _with_object(robot: Robot, size: Array, boxes: list[Box]) -> KnotConstraints
     """
     import pinocchio as pin
 
-    model, data, limit = robot.model, robot.model.createData(), robot.torque_limit
+    model = robot.model
+    data = robot.model.createData()
+    limit = robot.torque_limit
     tip = Tip(robot)
 
     def knot(q: Array, dq: Array, ddq: Array) -> tuple[Array, Array, Array, Array]:
         values, gradient = _object_values(tip, q, size, boxes)
         pin.computeRNEADerivatives(model, data, q, dq, ddq)
         # Pinocchio fills the upper half of the symmetric M only.
-        inertia, torque = np.triu(data.M) + np.triu(data.M, 1).T, np.array(data.tau)
+        inertia = np.triu(data.M) + np.triu(data.M, 1).T
+        torque = np.array(data.tau)
         g = np.concatenate([values, limit - torque, limit + torque])
         rows = [
             (gradient, data.dtau_dq),

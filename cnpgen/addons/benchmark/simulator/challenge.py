@@ -62,7 +62,8 @@ def challenge_plant(folder: str | Path) -> Plant:
         UsageError: The folder is not a clone.
         MachineError: The environment cannot be imported or is of another version.
     """
-    place, module_file = Path(folder).resolve(), f"{MODULE.replace('.', '/')}.py"
+    place = Path(folder).resolve()
+    module_file = f"{MODULE.replace('.', '/')}.py"
     if not (place / module_file).is_file():
         raise UsageError(
             f"{folder} is no clone of the Air Hockey Challenge's environment: it has no {module_file}",
@@ -105,12 +106,11 @@ def execute_in_challenge(
         )
     environment = _environment(scene.plant.environment)
     try:
-        start_q, start_speed = (
-            _all_joints(scene, reference.q[:1])[0],
-            _all_joints(scene, start_dq[None])[0],
-        )
+        start_q = _all_joints(scene, reference.q[:1])[0]
+        start_speed = _all_joints(scene, start_dq[None])[0]
         environment.begin(start_q, start_speed, scene.puck, scene.puck_velocity)
-        tick, done = 0, False
+        tick = 0
+        done = False
         while not done:
             done = environment.advance(_action(scene, reference, tick))
             tick += TICKS_PER_STEP
@@ -151,14 +151,13 @@ def _tick_record(
     scene: SimulatorScene, reference: Reference, environment: Any
 ) -> TickRecord:
     """Return the recorded states in the robot's frame."""
-    robot, planned = (
-        scene.robot,
-        [JOINTS.index(name) for name in scene.robot.joint_names],
-    )
+    robot = scene.robot
+    planned = [JOINTS.index(name) for name in scene.robot.joint_names]
     q, torque, puck, velocity, touched = (
         np.array(column) for column in zip(*environment.recorded, strict=True)
     )
-    q, evaluated = q[:, planned], Tip(robot)
+    q = q[:, planned]
+    evaluated = Tip(robot)
     tip, rotation, _ = (
         np.array(part) for part in zip(*map(evaluated.at, q), strict=True)
     )
@@ -256,7 +255,8 @@ class _Recorder:
         velocity: tuple[float, float] = (0.0, 0.0),
     ) -> None:
         """Reset to positions and velocities of the arm, shape (7,), and of the puck [m] and [m/s], shape (2,)."""
-        self.recorded, self._start = [], dq
+        self.recorded = []
+        self._start = dq
         self.violated_steps = {constraint.name: 0 for constraint in self.constraints}
         self._frame = np.array(self.env_info["robot"]["base_frame"][0])
         self._puck = (self._frame @ [*puck, 0.0, 1.0])[:2]

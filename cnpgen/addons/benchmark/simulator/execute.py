@@ -167,7 +167,8 @@ class _Run:
 
     def __init__(self, scene: SimulatorScene, reference: Reference) -> None:
         self._mujoco = load_mujoco()
-        self._scene, self._reference = scene, reference
+        self._scene = scene
+        self._reference = reference
         self._model = compile_scene(scene)
         self._data = self._mujoco.MjData(self._model)
         self._control = Controller(scene.problem, scene.robot, scene.plant)
@@ -181,10 +182,13 @@ class _Run:
 
     def simulate(self, start_dq: Array) -> TickRecord:
         """Simulate to the end and return the record."""
-        data, n = self._data, self._n
-        data.qpos[:n], data.qvel[:n] = self._reference.q[0], start_dq
+        data = self._data
+        n = self._n
+        data.qpos[:n] = self._reference.q[0]
+        data.qvel[:n] = start_dq
         if self._scene.puck is not None:
-            data.qpos[n:], data.qvel[n:] = self._scene.puck, self._scene.puck_velocity
+            data.qpos[n:] = self._scene.puck
+            data.qvel[n:] = self._scene.puck_velocity
         self._mujoco.mj_forward(self._model, data)
         tick = 0
         while not self._is_over(tick):
@@ -193,7 +197,8 @@ class _Run:
         states, tip, rotation, reference, torque, speeds, touched, force = (
             np.array(column) for column in zip(*self._rows, strict=True)
         )
-        puck, velocity = states[:, n:], speeds[:, n:]
+        puck = states[:, n:]
+        velocity = speeds[:, n:]
         if self._scene.puck is None:
             puck = velocity = np.full((len(states), 2), np.nan)
         use = torque / self._control.limit
@@ -212,13 +217,12 @@ class _Run:
 
     def _step(self, tick: int) -> None:
         """Record the state, compute the torque, and simulate one tick."""
-        data, n = self._data, self._n
+        data = self._data
+        n = self._n
         desired = self._reference.at(tick)
         torque = self._control(data.qpos[:n].copy(), data.qvel[:n].copy(), desired)
-        tip, rotation = (
-            data.site_xpos[self._tip].copy(),
-            data.site_xmat[self._tip].reshape(3, 3).copy(),
-        )
+        tip = data.site_xpos[self._tip].copy()
+        rotation = data.site_xmat[self._tip].reshape(3, 3).copy()
         state = data.qpos.copy(), tip, rotation, desired[0], torque, data.qvel.copy()
         data.qfrc_applied[:n] = torque
         self._mujoco.mj_step(self._model, data, round(TICK_S / SIMULATION_STEP_S))
@@ -237,7 +241,9 @@ class _Run:
 
     def _contacts(self) -> tuple[Array, Array]:
         """Return whether the mallet touches the puck, and its normal and friction force on the table [N]."""
-        touched, total, force = False, np.zeros(2), np.zeros(6)
+        touched = False
+        total = np.zeros(2)
+        force = np.zeros(6)
         for index in range(self._data.ncon):
             contact = self._data.contact[index]
             pair = {int(contact.geom1), int(contact.geom2)}
@@ -249,7 +255,9 @@ class _Run:
 
     def _is_over(self, tick: int) -> bool:
         """Return whether the result is final."""
-        reference, data, n = self._reference, self._data, self._n
+        reference = self._reference
+        data = self._data
+        n = self._n
         if not np.isfinite(data.qpos).all():
             return True
         if tick < reference.ticks:

@@ -198,8 +198,10 @@ def outcome_of(
     scene: SimulatorScene, reference: Reference, goal_xyz: Array, record: TickRecord
 ) -> Executed:
     """Compute the result of an execution whose plan ends with the tip at ``goal_xyz`` [m], shape (3,)."""
-    ticks, height = min(reference.ticks, len(record.q)), scene.height
-    during, tip = slice(0, ticks), scene.on_table(record.tip)
+    ticks = min(reference.ticks, len(record.q))
+    height = scene.height
+    during = slice(0, ticks)
+    tip = scene.on_table(record.tip)
     goal_distance = float(np.linalg.norm(record.tip[ticks - 1] - goal_xyz))
     executed = Executed(
         finished=goal_distance < MAX_GOAL_DISTANCE_M,

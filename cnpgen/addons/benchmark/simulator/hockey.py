@@ -15,9 +15,12 @@ HOME_M, LENGTH_M, WIDTH_M = 0.53, 1.948, 1.038  # home edge along x; playing fie
 GOAL_LINE_M = HOME_M + LENGTH_M
 GOAL_WIDTH_M = 0.25
 BAND_M = 0.045  # half the width of a band
-PUCK_RADIUS_M, PUCK_MASS_KG, PUCK_DRAG_N_S_M = 0.03165, 0.01, 0.005
+PUCK_RADIUS_M = 0.03165
+PUCK_MASS_KG = 0.01
+PUCK_DRAG_N_S_M = 0.005
 # Height: from the tip down to the table.
-MALLET_RADIUS_M, MALLET_HEIGHT_M = 0.04815, 0.0645
+MALLET_RADIUS_M = 0.04815
+MALLET_HEIGHT_M = 0.0645
 PUCK_HEIGHT_M = 0.006
 PUCK_OFFSET_M = 0.07  # distance of the tip from the puck's centre at the end of a hit
 # Of the path left when both discs meet.

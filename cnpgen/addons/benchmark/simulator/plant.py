@@ -34,7 +34,8 @@ IIWA = {
     "joint_7": Friction(0.299238, 0.1),
 }
 # Of the rated torque, the second per rad/s; for other joints.
-DRY_FRACTION, VISCOUS_FRACTION = 2e-3, 1e-3
+DRY_FRACTION = 2e-3
+VISCOUS_FRACTION = 1e-3
 
 
 @dataclass(frozen=True)

@@ -38,7 +38,8 @@ class Reference:
     def at(self, ticks: int | NDArray[np.int64]) -> tuple[Array, Array, Array]:
         """Return positions, velocities and accelerations at a tick, shape (n,) each, or at K ticks, shape (K, n)."""
         last = len(self.q) - 1
-        rows, moving = np.minimum(ticks, last), np.less_equal(ticks, last)[..., None]
+        rows = np.minimum(ticks, last)
+        moving = np.less_equal(ticks, last)[..., None]
         return self.q[rows], self.dq[rows] * moving, self.ddq[rows] * moving
 
 

@@ -18,7 +18,8 @@ from cnpgen.addons.benchmark.simulator.reference import TICK_S
 from cnpgen.errors import MachineError, MissingExtraError, requires_extra
 from cnpgen.store.files.atomic import machine_error, machine_errors
 
-IMAGE_WIDTH, IMAGE_HEIGHT = 800, 600
+IMAGE_WIDTH = 800
+IMAGE_HEIGHT = 600
 FILM_FRAMES_PER_S = 25
 SLOW_MOTION_FACTOR = 4
 FILM_TAIL_S = 1.0  # shown after the plan
@@ -89,11 +90,9 @@ def _imageio() -> Any:
 @contextmanager
 def _renderer(execution: Execution) -> Iterator[Callable[[int], Image]]:
     """Open a renderer of the ticks of an execution."""
-    mujoco, scene, model = (
-        load_mujoco(),
-        execution.scene,
-        compile_scene(execution.scene),
-    )
+    mujoco = load_mujoco()
+    scene = execution.scene
+    model = compile_scene(execution.scene)
     try:
         renderer = mujoco.Renderer(model, IMAGE_HEIGHT, IMAGE_WIDTH)
     except Exception as error:
@@ -103,7 +102,8 @@ def _renderer(execution: Execution) -> Iterator[Callable[[int], Image]]:
             f"this machine cannot draw without a screen ({text}): install the libraries of EGL, or of OSMesa with"
             " MUJOCO_GL=osmesa"
         ) from error
-    data, camera = mujoco.MjData(model), mujoco.MjvCamera()
+    data = mujoco.MjData(model)
+    camera = mujoco.MjvCamera()
     view = OBJECT_VIEW if scene.height is None else HOCKEY_VIEW
     camera.lookat[:], (camera.distance, camera.azimuth, camera.elevation) = (
         view[:3],

@@ -114,7 +114,8 @@ def simulate_plans(
         MachineError: MuJoCo is missing, the environment cannot be imported, or a worker
             died.
     """
-    plant, plans = as_plant(plant), correct_tips(plans)
+    plant = as_plant(plant)
+    plans = correct_tips(plans)
     load_mujoco()
     if environment is not None:
         if plans.problem.parameters.tilts_table:
@@ -183,16 +184,15 @@ def simulator_scene(problem: Plans, plant: Plant) -> SimulatorScene:
     direction. The columns ``puck_xy`` [m] and ``puck_velocity`` [m/s] of hits of moving
     pucks define the puck at the start.
     """
-    record, values = problem.problem, problem.boundary.parameters
+    record = problem.problem
+    values = problem.boundary.parameters
     loaded, robot = open_problem(
         record if values is None else with_payload_of(record, values[0])
     )
     scene = SimulatorScene(loaded, robot, plant, problem.scene.poses[0])
     if values is not None:
-        table, up = (
-            table_frame(record.parameters, loaded.table_origin, values),
-            upright_axes(record.parameters, values),
-        )
+        table = table_frame(record.parameters, loaded.table_origin, values)
+        up = upright_axes(record.parameters, values)
         position = table.to_world(np.zeros((1, 3)))[0]
         scene = replace(
             scene,

@@ -40,10 +40,8 @@ SUPPORT_DEPTH_M = 0.05  # half thickness of the body that supports the tip
 _SOFT = 'condim="3" solref="0.004 1" solimp="0.95 0.99 0.001"'
 # as in the Air Hockey Challenge
 _TABLE = 'condim="3" friction="0.08 0.08" solref="0.0125 0.5" solimp="0.9 0.999 0.001"'
-_CENTER_M, _HALF_SIDE_M = (
-    hockey.HOME_M + hockey.LENGTH_M / 2,
-    (hockey.WIDTH_M - hockey.GOAL_WIDTH_M) / 4,
-)
+_CENTER_M = hockey.HOME_M + hockey.LENGTH_M / 2
+_HALF_SIDE_M = (hockey.WIDTH_M - hockey.GOAL_WIDTH_M) / 4
 _SIDES = (("left", 1), ("right", -1))
 # The bands and the four halves of both goals' sides: centre and half sizes over the
 # table [m].
@@ -276,7 +274,8 @@ def _puck(surface: float, height: float) -> Iterator[str]:
     Gravity does not move the puck on a tilted table.
     """
     inertia = f"{PUCK_INERTIA} {PUCK_INERTIA} {2 * PUCK_INERTIA}"
-    low, high = height - 0.05, height + hockey.PUCK_HEIGHT_M
+    low = height - 0.05
+    high = height + hockey.PUCK_HEIGHT_M
     yield f'<body name="puck" pos="0 0 {surface}" gravcomp="1">'
     yield f'<inertial pos="0 0 0" mass="{hockey.PUCK_MASS_KG}" diaginertia="{inertia}"/>'
     yield f'<joint name="puck x" type="slide" axis="1 0 0" damping="{hockey.PUCK_DRAG_N_S_M}"/>'

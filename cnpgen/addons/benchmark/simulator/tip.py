@@ -10,7 +10,8 @@ class Tip:
     """Kinematics of the tip; not thread-safe, because Pinocchio's data are reused."""
 
     def __init__(self, robot: Robot) -> None:
-        self._model, self._data = robot.model, robot.model.createData()
+        self._model = robot.model
+        self._data = robot.model.createData()
         self._frame = robot.tip_frame
 
     def at(self, q: Array) -> tuple[Array, Array, Array]:

@@ -97,7 +97,8 @@ class ChunkStep(ProcessorStep):  # type: ignore[misc] # LeRobot has no types
         if self._zero.shape != (n,) or not np.isfinite(self._zero).all():
             text = f"must be finite and have shape ({n},), got {zero!r:.100}"
             raise UsageError(text, argument="zero")
-        self._factor, self._clock = RADIANS[unit], clock
+        self._factor = RADIANS[unit]
+        self._clock = clock
         self._times = np.arange(options["length"]) / options["rate"]
         self._stale_after = float(options["stale_after"])
         self._is_new = True  # until the first observation of an episode
@@ -142,12 +143,15 @@ class ChunkStep(ProcessorStep):  # type: ignore[misc] # LeRobot has no types
         if STATE not in observation:
             raise UsageError(f"an observation has no {STATE!r}")
         values = _numpy(observation[STATE])
-        n, now = len(self._zero), self._clock()
+        n = len(self._zero)
+        now = self._clock()
         if values.size != values.shape[-1] or values.size < n:
             text = f"must have shape (1, D) with at least {n} joints"
             raise UsageError(f"{STATE} {text}, got {values.shape}")
         values = values.reshape(-1)
-        q, dq, last = self._radians(values[:n]), np.zeros(n), self._observation
+        q = self._radians(values[:n])
+        dq = np.zeros(n)
+        last = self._observation
         if self._is_new:
             self._begin(q, now)
         elif last is not None and now > last.time:
@@ -188,7 +192,8 @@ class ChunkStep(ProcessorStep):  # type: ignore[misc] # LeRobot has no types
             raise UsageError(
                 "no observation precedes the chunk: put the same step into the preprocessor"
             )
-        chunk, n = _numpy(action[0]), len(self._zero)
+        chunk = _numpy(action[0])
+        n = len(self._zero)
         if not n <= chunk.shape[1] <= n + len(seen.others):
             text = f"{n} joints and at most the {len(seen.others)} other columns"
             raise UsageError(

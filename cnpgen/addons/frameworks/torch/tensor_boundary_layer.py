@@ -29,7 +29,8 @@ class TensorBoundaryLayer:
 
     @checked_arguments
     def __init__(self, layer: BoundaryLayer) -> None:
-        self.layer, problem = layer, layer.problem
+        self.layer = layer
+        problem = layer.problem
         kernels = problem_kernels(
             problem, load_robot(problem), *choose_backend("numpy")
         )
@@ -103,10 +104,8 @@ class TensorBoundaryLayer:
     def _projected(self, path: torch.Tensor, poses: torch.Tensor) -> torch.Tensor:
         """Project the interior control points onto the equalities, as ``projection_change`` of the planner does."""
         kind = {"device": path.device, "dtype": path.dtype}
-        table, response = (
-            torch.tensor(self._table, **kind),
-            torch.tensor(self._response, **kind),
-        )
+        table = torch.tensor(self._table, **kind)
+        response = torch.tensor(self._response, **kind)
         # Response of the path at one collocation phase to a change at another one.
         coupling = table[:, self._interior] @ response
         for _ in range(self._steps):

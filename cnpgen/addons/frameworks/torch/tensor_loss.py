@@ -52,13 +52,12 @@ class TensorLoss:
                 " use cnpgen.addons.frameworks.torch.plan_loss, which measures their distances on the CPU",
                 argument="loss",
             )
-        self.loss, robot = loss, load_robot(loss.problem)
+        self.loss = loss
+        robot = load_robot(loss.problem)
         kernels = problem_kernels(loss.problem, robot, *choose_backend("numpy"))
         tape = kernels.tape(loss_values, form=loss.form)
-        self._tape, self._relaxed_values = (
-            TensorTape(tape),
-            tape.inputs[relaxation_argument(loss.problem)],
-        )
+        self._tape = TensorTape(tape)
+        self._relaxed_values = tape.inputs[relaxation_argument(loss.problem)]
         self._time_varying = time_varying_conditions(loss.problem, robot, loss.form)
         self._tables: dict[tuple[Any, ...], tuple[torch.Tensor, ...]] = {}  # the latest
         self._integrate = torch.compile(self._terms) if compiled else self._terms
@@ -115,10 +114,8 @@ class TensorLoss:
             tensors[name].to(**kind) for name in ("path", "rate", "weights")
         )
         poses = tensors.get("obstacle_poses", path.new_zeros((len(path), 0))).to(**kind)
-        relaxation, shift = (
-            path.new_zeros((self._relaxed_values, 1, 1)),
-            number("shift", shift),
-        )
+        relaxation = path.new_zeros((self._relaxed_values, 1, 1))
+        shift = number("shift", shift)
         if start_tip is not None and self._relaxed_values:
             tip = tensors["start_tip"].detach().to("cpu", torch.float64).numpy()
             bound = relaxation_of(self._time_varying, self._basis(shift).s, tip)
@@ -155,10 +152,8 @@ class TensorLoss:
             & rate.isfinite().all(1)
         )
         # Ones keep operations and gradients finite; their results are dropped.
-        path, rate = (
-            torch.where(valid[:, None, None], path, 1.0),
-            torch.where(valid[:, None], rate, 1.0),
-        )
+        path = torch.where(valid[:, None, None], path, 1.0)
+        rate = torch.where(valid[:, None], rate, 1.0)
         terms = self._integrate(*_FiniteGradient.apply(path, rate), *arguments)
         # Nan marks the loss of an invalid plan.
         terms = torch.where(valid[:, None], terms, torch.nan)

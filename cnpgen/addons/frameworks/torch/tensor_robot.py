@@ -127,7 +127,8 @@ class TensorRobot:
         return rows
 
     def _rows(self, name: str, values: torch.Tensor) -> torch.Tensor:
-        tensor, n = real_tensor(name, values), len(self.model.joint_names)
+        tensor = real_tensor(name, values)
+        n = len(self.model.joint_names)
         if tensor.ndim != 2 or tensor.shape[1] != n:
             raise UsageError(
                 f"must have shape (N, {n}), got {tuple(tensor.shape)}", argument=name

@@ -25,7 +25,8 @@ def spline_derivatives(
     Returns:
         Tensors of shape (N, K, ...).
     """
-    points, s = control.shape[1], s.expand(len(control), s.shape[-1])
+    points = control.shape[1]
+    s = s.expand(len(control), s.shape[-1])
     spans = points - degree
     # The span itself is constant: derivatives by s are those of its polynomial.
     span = (s.detach() * spans).long().clamp(0, spans - 1)
@@ -94,7 +95,8 @@ def start_points(
         for n in (spec.path_control_points, spec.rate_control_points)
     )
     # r and r' at the start.
-    first_rate, change = rate[:, :1], speed.eta * (rate[:, 1:2] - rate[:, :1])
+    first_rate = rate[:, :1]
+    change = speed.eta * (rate[:, 1:2] - rate[:, :1])
     first = dq / first_rate
     # From ddq = p'' r^2 + p' r r', solved for p''.
     second = (ddq - first * change * first_rate) / first_rate**2

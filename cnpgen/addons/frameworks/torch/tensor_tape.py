@@ -165,10 +165,8 @@ def _divides_by_guarded(tape: Tape, k: int) -> bool:
 
 def _stacked(rows: list[Value], arguments: Sequence[torch.Tensor]) -> torch.Tensor:
     """Stack rows, which may be constants, in the shape that the arguments broadcast to."""
-    like, shape = (
-        arguments[0],
-        torch.broadcast_shapes(*(argument.shape[1:] for argument in arguments)),
-    )
+    like = arguments[0]
+    shape = torch.broadcast_shapes(*(argument.shape[1:] for argument in arguments))
     if not rows:
         return like.new_zeros((0, *shape))
     tensors = [

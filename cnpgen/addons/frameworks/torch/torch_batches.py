@@ -49,7 +49,9 @@ class TensorBatch(dict[str, torch.Tensor]):
                 for name in names
             }
         )
-        self.table, self.layout, self.normalization = table, layout, normalization
+        self.table = table
+        self.layout = layout
+        self.normalization = normalization
 
     @property
     def columns(self) -> dict[str, slice]:
@@ -133,7 +135,8 @@ class BatchDataset(data.IterableDataset[TensorBatch]):  # type: ignore[misc]
         worker = data.get_worker_info()
         if worker is None:
             return map(to_torch, self.batches)
-        note, batches = self._worker_positions[worker.id], self.batches
+        note = self._worker_positions[worker.id]
+        batches = self.batches
         epoch, times_set = note.tolist()
         if epoch in {-1, batches.epoch} or times_set not in {-1, batches.times_set}:
             epoch = None

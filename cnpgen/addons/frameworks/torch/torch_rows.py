@@ -42,10 +42,12 @@ class RowDataset(data.Dataset[Tensors]):  # type: ignore[misc]
         normalize: bool | Normalization = True,
         dtype: DTypeLike = "float32",
     ) -> None:
-        self._dataset, self._split = dataset, split
+        self._dataset = dataset
+        self._split = split
         self._length = len(dataset[split])
         self._fields = None if fields is None else list(fields)
-        self._normalize, self._dtype = normalize, dtype
+        self._normalize = normalize
+        self._dtype = dtype
 
     def __len__(self) -> int:
         return self._length
