@@ -88,7 +88,12 @@ CAPTIONS = {
     "reference": "Reference",
     "benchmarks": "Benchmarks",
 }
-MADE = "api", "cli", "keys"  # pages of the reference without a file in the repository
+MADE = (
+    "api",
+    "cli",
+    "keys",
+    "scene-elements",
+)  # pages of the reference without a file in the repository
 OTHERS = (
     "README",
     "CHANGELOG",

@@ -35,6 +35,7 @@ def test_all_pages_are_listed_by_kind(capsys):
         "api",
         "cli",
         "keys",
+        "scene-elements",
     }
 
 

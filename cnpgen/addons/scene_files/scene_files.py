@@ -141,7 +141,7 @@ def _report(path: Path, accounts: Sequence[Account]) -> None:
     accepted = sorted({name for account in accounts for name in account.accepted})
     if unused:
         _LOG.info(
-            "%s: not used: %s (the reasons are in 'cnpgen docs scene-files')",
+            "%s: not used: %s (the reasons are in 'cnpgen docs scene-elements')",
             path,
             listed(unused),
         )

@@ -12,6 +12,7 @@ import pytest
 
 from cnpgen.addons.scene_files.moveit_scenes import read_moveit
 from cnpgen.addons.scene_files.moveit_unused import HARMLESS, UNUSED, UNUSED_ELEMENTS
+from cnpgen.cli.docs_command import list_pages, page_text
 from cnpgen.errors import UsageError
 from cnpgen.problems.scenes.scene_problem import SceneProblem, checked_scene
 from cnpgen.problems.scenes.scene_reader import ReadingOptions
@@ -347,8 +348,7 @@ def test_an_entry_of_the_tables_does_not_change_the_problem(entry: str) -> None:
 
 
 def test_the_docs_print_the_lists() -> None:
-    page = Path(__file__).parents[3] / "docs" / "how-to" / "scene-files.md"
-    text = page.read_text(encoding="utf-8")
+    text = page_text(list_pages()["scene-elements"])
     for table in (HARMLESS, UNUSED):
         for key, reason in table.items():
             assert f"- `{key.lstrip('.')}`: {reason}\n" in text
