@@ -51,10 +51,11 @@ class _Limit:
         # Blocks may be nested and run in several threads: only the outermost changes
         # the libraries.
         if self._inside == 0:
-            found = (
-                (set_threads, get_threads()) for get_threads, set_threads in libraries
-            )
-            self._before = [(each, count) for each, count in found if count != 1]
+            self._before = [
+                (set_threads, count)
+                for get_threads, set_threads in libraries
+                if (count := get_threads()) != 1
+            ]
             for set_threads, _ in self._before:
                 set_threads(1)
         self._inside += 1
@@ -86,10 +87,13 @@ class OneThread(ContextDecorator):
         shared, own = _libraries()
         with self._lock:
             self._limit.enter(shared)
-        self._own.enter(own)
+        # Most processes have no such library.
+        if own:
+            self._own.enter(own)
 
     def __exit__(self, *_: object) -> None:
-        self._own.leave()
+        if _libraries()[1]:
+            self._own.leave()
         with self._lock:
             self._limit.leave()
 

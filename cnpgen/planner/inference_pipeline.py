@@ -18,7 +18,7 @@ from cnpgen.kernels.tape import GridSpec
 from cnpgen.planner.control_point_functions import projected_path
 from cnpgen.planner.control_points import lines_at_rest
 from cnpgen.planner.expressions import effective_steps, static_violation
-from cnpgen.planner.model import Model, ModelConfig, Outputs
+from cnpgen.planner.model import Model, ModelConfig, Outputs, outputs_of
 from cnpgen.planner.task_preprocessor import TaskPreprocessor, make_task_preprocessor
 from cnpgen.planner.tasks import Tasks, ends_of, lanes, rows
 from cnpgen.planner.time_parametrization import (
@@ -35,6 +35,7 @@ from cnpgen.problems.load_robot import load_robot
 from cnpgen.problems.problem import Problem
 from cnpgen.problems.problem_record import ProblemRecord
 from cnpgen.robots.robot import Robot
+from cnpgen.schema.unchecked import unchecked
 from cnpgen.store.scene_table import OBSTACLE_POSES
 from cnpgen.trajectory.boundary import Boundary, anchor_line
 from cnpgen.trajectory.spline import basis, chebyshev
@@ -204,20 +205,19 @@ class InferencePipeline:
         tasks, motion = self.planned(
             model, boundary, (columns or {}).get(OBSTACLE_POSES)
         )
-        return Plans(
-            problem=model.problem,
-            boundary=boundary,
-            path_control_points=motion.path,
-            rate_control_points=motion.rate,
-            degree=motion.degree,
-            columns={
-                **(columns or {}),
-                "start_xyz": tasks.start_xyz,
-                "goal_xyz": tasks.goal_xyz,
-            },
-            sample_id=np.arange(len(boundary)) if sample_id is None else sample_id,
-            status=np.zeros(len(boundary), np.uint8),  # unknown
-        )
+        columns = {
+            **(columns or {}),
+            "start_xyz": tasks.start_xyz,
+            "goal_xyz": tasks.goal_xyz,
+        }
+        ids = np.arange(len(boundary)) if sample_id is None else sample_id
+        status = np.zeros(len(boundary), np.uint8)  # unknown
+        parts = boundary, motion.path, motion.rate, motion.degree, columns, ids, status
+        plans = unchecked(Plans, model.problem, *parts, "", "", False)
+        # All other shapes follow from the model.
+        if sample_id is not None or len(columns) > 2:
+            plans.__post_init__()
+        return plans
 
     def planned(
         self, model: Model, boundary: Boundary, obstacle_poses: Array | None = None
@@ -241,13 +241,13 @@ class InferencePipeline:
         for _ in range(1, model.config.iterations):
             # Each further evaluation corrects the path of the one before.
             outputs, path = self._outputs(model, self.prepare.along(tasks, path), ends)
-        return Motion(path, outputs.rate, model.problem.trajectory.degree)
+        return unchecked(Motion, path, outputs.rate, model.problem.trajectory.degree)
 
     def _outputs(
         self, model: Model, tasks: Tasks, ends: Array
     ) -> tuple[Outputs, Array]:
         """Evaluate the network; return its outputs, and the projected path, shape (N, C, n)."""
-        outputs = model.outputs(tasks)
+        outputs = outputs_of(model, tasks)
         (path,) = self.path(
             ends, lanes(outputs.offsets), lanes(outputs.rate), tasks.scene.lanes
         )

@@ -102,16 +102,7 @@ class Model:
 
         Sums and the exponential are in float64.
         """
-        activations = forward(self._weights, self.features.of(tasks))
-        # The head ends in tanh: offsets are within +- path_scale [rad].
-        offsets = self.config.path_scale * activations.path.astype(np.float64)
-        if tasks.correction is not None:
-            offsets += tasks.correction.reshape(offsets.shape)
-        return Outputs(
-            offsets,
-            np.exp(activations.log_rate.astype(np.float64))
-            / tasks.expected_time[:, None],
-        )
+        return outputs_of(self, tasks)
 
     @cached_property
     def _weights(self) -> Weights:
@@ -133,6 +124,18 @@ class Model:
     def is_rest_to_rest(self) -> bool:
         """Whether all of its motions begin and end at rest, so that they may be scaled in time."""
         return is_rest_to_rest(self.zero_conditions, self.fixed_at_goal)
+
+
+def outputs_of(model: Model, tasks: Tasks) -> Outputs:
+    """Evaluate the network like ``Model.outputs``, without a check of the argument's type."""
+    activations = forward(model._weights, model.features.of(tasks))
+    # The head ends in tanh: offsets are within +- path_scale [rad].
+    offsets = model.config.path_scale * activations.path.astype(np.float64)
+    if tasks.correction is not None:
+        offsets += tasks.correction.reshape(offsets.shape)
+    rate = np.exp(activations.log_rate.astype(np.float64))
+    rate /= tasks.expected_time[:, None]
+    return Outputs(offsets, rate)
 
 
 def is_rest_to_rest(zero_conditions: Iterable[str], fixed_at_goal: int) -> bool:

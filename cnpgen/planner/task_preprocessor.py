@@ -94,7 +94,7 @@ class TaskPreprocessor:
         )
         # Without the kernel of ``reaching_time`` the unit is that of the distance.
         if self.reaching_time is None:
-            limit = self.velocity_limit * self._factor(parameters)
+            limit = self._velocity_limits(parameters)
             time = expected_time(boundary, limit, least=self.least_time)
         else:
             time = self.reaching_time(ends)[0][0]
@@ -192,12 +192,13 @@ class TaskPreprocessor:
             )
         return ranges.checked(np.asarray(values, np.float64))
 
-    def _factor(self, parameters: Array | None) -> Array | float:
-        """Return the factor of the velocity limits of every task, shape (N, 1), or 1."""
-        names = self.problem.parameters.names
+    def _velocity_limits(self, parameters: Array | None) -> Array:
+        """Return the velocity limits of all tasks [rad/s], shape (n,), or of every task, shape (N, n)."""
+        names = () if parameters is None else self.problem.parameters.names
         if parameters is None or "velocity_factor" not in names:
-            return 1.0
-        return parameters[:, names.index("velocity_factor"), None]
+            return self.velocity_limit
+        factor = parameters[:, names.index("velocity_factor"), None]
+        return self.velocity_limit * factor
 
     def _via_offsets(self, boundary: Boundary, via_point: Array) -> Array:
         """Return offsets of lines through via points from straight ones at interior points [rad], shape (N, m, n)."""

@@ -63,8 +63,7 @@ def _are_usual(robot: Robot, states: Sequence[NDArray[Any]]) -> bool:
     The states are positions, velocities and accelerations of one state, or of two
     without or with the last accelerations; shape (N, n) each.
     """
-    shape = (len(states[0]), robot.n)
-    if any(values.shape != shape for values in states):
+    if {values.shape for values in states} != {(len(states[0]), robot.n)}:
         return False
     # Columns are in the order of state_bounds; later ones may be missing.
     values = np.concatenate(states, axis=1)

@@ -79,7 +79,11 @@ def scene_of(
         parts.append(constraint.scene_values(goal_xyz, goal_velocity))
     if parameters is not None:
         parts.append(parameters)
-    poses = np.concatenate(parts, axis=1) if parts else np.empty((len(start_xyz), 0))
+    if len(parts) == 1:
+        (poses,) = parts
+    else:
+        parts.append(np.empty((len(start_xyz), 0)))
+        poses = np.concatenate(parts, axis=1)
     scene = Scene(tuple(problem.obstacle), poses)
     return scene if obstacle_poses is None else scene.with_poses(obstacle_poses)
 

@@ -19,6 +19,7 @@ from numpy.typing import ArrayLike, NDArray
 from cnpgen.arrays import Array
 from cnpgen.errors import UsageError
 from cnpgen.schema.arguments import check_memory_of_rows, integer, numbers
+from cnpgen.schema.unchecked import unchecked
 from cnpgen.trajectory.spline import EndDerivatives, end_derivatives
 from cnpgen.trajectory.trajectory_spec import TrajectorySpec
 
@@ -135,8 +136,8 @@ class Boundary:
         """Return the boundary conditions that are not None: name -> values."""
         return {
             name: values
-            for name, values in self.arrays().items()
-            if name != "parameters"
+            for name, values in vars(self).items()
+            if values is not None and name != "parameters"
         }
 
     def arrays(self) -> dict[str, Array]:
@@ -227,24 +228,25 @@ def boundary_of(  # noqa: PLR0917 - in the order of the paper
 
 def _one_motion(n: int, conditions: Sequence[ArrayLike | None]) -> Boundary | None:
     """Return the conditions of one motion in a quarter of the time; None if they need the checks of ``boundary_of``."""
-    count = len(conditions) - (conditions[-1] is None)
-    # One array for all conditions, shape (conditions, 1, n), needs one check.
-    rows = np.zeros((count, 1, n))
-    for row, values in zip(rows, conditions, strict=False):
-        if values is None:
-            continue
+    # Missing derivatives are zero, a missing goal acceleration is free.
+    free = () if conditions[-1] is not None else (None,)
+    given = conditions[: len(conditions) - len(free)]
+    zero, shape = np.zeros(n), (n,)
+    parts = [zero if values is None else values for values in given]
+    for values in parts:
+        # The type of most arrays is this object; others are converted elsewhere.
         if (
             type(values) is not np.ndarray
-            or values.shape != (n,)
-            or values.dtype != rows.dtype
+            or values.dtype is not zero.dtype
+            or values.shape != shape
         ):
             return None
-        row[0] = values
-    return (
-        Boundary(*rows)
-        if conditions[0] is not None and math.isfinite(rows.sum())
-        else None
-    )
+    # One array for all conditions needs one check.
+    numbers_of_all = np.concatenate(parts)
+    if conditions[0] is None or not math.isfinite(np.add.reduce(numbers_of_all)):
+        return None
+    rows = numbers_of_all.reshape(len(parts), 1, n)
+    return unchecked(Boundary, *rows, *free, None)
 
 
 def _rows(name: str, values: ArrayLike, n: int) -> Array:

@@ -62,6 +62,13 @@ def test_a_plan_is_the_same_alone_and_in_a_batch(planner, rows):
         )
 
 
+def test_plans_that_the_model_determines_have_all_fields_and_pass_the_checks(
+    planner, rows
+):
+    plan = planned(planner, rows[0])
+    assert list(vars(plan)) == list(vars(replace(plan)))
+
+
 def test_missing_velocities_and_accelerations_are_zero(planner, rows):
     given = planner.plan(rows.start_q[0], rows.goal_q[0])
     np.testing.assert_array_equal(given.boundary.start_dq, 0)

@@ -168,7 +168,7 @@ def forward(weights: Weights, features: AnyArray) -> Activations:
         trunk.append(_tanh_layer(layer, trunk[-1]))
     hidden = _tanh_layer(hidden_weights, trunk[-1])
     # The time head has no tanh: logarithms of rates are unbounded.
-    log_rate = trunk[-1] @ rate_weight
+    log_rate = trunk[-1].dot(rate_weight)
     log_rate += rate_bias
     return Activations(
         tuple(trunk), hidden, _tanh_layer(path_weights, hidden), log_rate
@@ -177,9 +177,10 @@ def forward(weights: Weights, features: AnyArray) -> Activations:
 
 def _tanh_layer(layer: tuple[AnyArray, AnyArray], x: AnyArray) -> AnyArray:
     weight, bias = layer
-    y: AnyArray = x @ weight
+    # The product of ``@``, in two thirds of its time for one row.
+    y: AnyArray = x.dot(weight)
     y += bias
-    np.tanh(y, out=y)
+    np.tanh(y, y)
     return y
 
 

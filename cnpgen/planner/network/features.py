@@ -34,6 +34,7 @@ SCENE = "scene"  # only if samples place obstacles
 PARAMETERS = "parameters"  # only for problems with parameters
 LINE = "line"  # only if the network corrects its own path
 BLOCKS = (*USUAL, ARRIVAL, PARAMETERS, SCENE, LINE)
+FIELDS = frozenset({*STATES, ARRIVAL, PARAMETERS})  # of ``Boundary``
 FEATURE_SETS = ("full", "no-scene", "states", "paper")
 # SI units; features with a smaller standard deviation are constant.
 MIN_DEVIATION = 1e-7
@@ -173,7 +174,7 @@ def count_features(
 
 def _block(tasks: Tasks, name: str) -> tuple[AnyArray, ...]:
     boundary = tasks.boundary
-    if name in {*STATES, ARRIVAL, PARAMETERS}:
+    if name in FIELDS:
         return (getattr(boundary, name),)
     if name == "sin_cos":
         # Forward kinematics is a polynomial of these sines and cosines.

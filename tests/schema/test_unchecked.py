@@ -1,0 +1,19 @@
+"""Objects of known values, built without their checks."""
+
+import numpy as np
+import pytest
+
+from cnpgen.schema.unchecked import unchecked
+from cnpgen.trajectory.spline_motion import Motion
+
+
+def test_an_unchecked_object_equals_a_checked_one():
+    path, rate = np.zeros((1, 9, 2)), np.ones((1, 8))
+    checked, made = Motion(path, rate, 7), unchecked(Motion, path, rate, 7)
+    assert vars(made) == vars(checked)
+    assert repr(made) == repr(checked)
+
+
+def test_every_field_needs_a_value():
+    with pytest.raises(ValueError, match="shorter"):
+        unchecked(Motion, np.zeros((1, 9, 2)))
