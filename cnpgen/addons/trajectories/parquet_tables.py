@@ -136,9 +136,13 @@ def _parquet_table(pyarrow: Any, content: bytes, schema: Any) -> Any:
     """
     columns = [schema.column(i) for i in range(len(schema))]
     texts = [part.path for part in columns if part.physical_type == "BYTE_ARRAY"]
-    table = pyarrow.parquet.ParquetFile(
+    file = pyarrow.parquet.ParquetFile(
         pyarrow.BufferReader(content), read_dictionary=texts
-    ).read()
+    )
+    # Every row group has dictionaries of its own. LeRobot writes lists of texts in
+    # several groups, which pyarrow cannot read at once.
+    groups = [file.read_row_group(i) for i in range(file.num_row_groups)]
+    table = pyarrow.concat_tables(groups) if groups else file.read()
     for name in table.column_names:
         chunks = table.column(name).chunks
         if texts and any(map(pyarrow.types.is_nested, [table.column(name).type])):

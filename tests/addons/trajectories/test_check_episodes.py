@@ -71,10 +71,13 @@ def write_lerobot(
     lengths = {
         "episode_index": list(range(len(episodes))),
         "length": [len(q) for q in episodes],
+        "tasks": [["move"]] * len(episodes),
     }
+    # LeRobot writes a row group per ten episodes.
     parquet.write_table(
         pyarrow.table(lengths),
         folder / "meta" / "episodes" / "chunk-000" / "file-000.parquet",
+        row_group_size=10,
     )
     return folder
 

@@ -61,7 +61,7 @@ def check(capsys: pytest.CaptureFixture[str], folder: Path) -> tuple[int, Any]:
 def test_planted_faults_are_found_in_a_folder_of_lerobot(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    states = [motion(seed) for seed in range(8)]
+    states = [motion(seed) for seed in range(12)]
     faults = {1: jumped, 4: in_degrees_from, 6: without_a_number}
     for index, fault in faults.items():
         states[index] = fault(states[index])
