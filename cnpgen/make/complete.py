@@ -33,6 +33,7 @@ from cnpgen.store.files.csv_table import read_csv_table
 from cnpgen.store.files.hdf5 import open_hdf5
 from cnpgen.store.files.kind import is_hdf5
 from cnpgen.store.paths import HDF5_KINDS, require_file
+from cnpgen.store.stated_units import refuse_other_units
 
 
 @dataclass(frozen=True, eq=False)
@@ -249,7 +250,7 @@ def read_tasks(
     )
     with machine_errors("read", path):
         if is_hdf5(path):
-            columns = _hdf5_columns(path)
+            columns = _hdf5_columns(path, fields)
         else:
             table = read_csv_table(path, example="goal_xyz.x,goal_xyz.y")
             columns = {name: table.numbers(name) for name in table.names}
@@ -301,9 +302,15 @@ def _joined(
     return np.stack([columns[name] for name in parts], axis=1)
 
 
-def _hdf5_columns(path: Path) -> dict[str, Array]:
+def _hdf5_columns(path: Path, fields: Mapping[str, Field]) -> dict[str, Array]:
+    units = {
+        name: field.unit
+        for field in fields.values()
+        for name in (field.name, *field.columns)
+    }
     with open_hdf5(path) as file:
         found = {name: column.read() for name, column in file.columns().items()}
+        refuse_other_units(file, units)
     try:
         columns: dict[str, Array] = {
             name: numbers(name, values) for name, values in found.items()

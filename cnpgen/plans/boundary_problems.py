@@ -20,7 +20,9 @@ from cnpgen.plans.format import (
     FORMAT,
     GOAL_OPTION,
     PLAN_FILE_VERSION,
+    SI_UNITS,
     refuse_misspelt,
+    report_unused,
 )
 from cnpgen.plans.plan_file import agreed_problem, stored_problem
 from cnpgen.plans.plans import Plans, make_plans
@@ -44,6 +46,7 @@ from cnpgen.store.paths import HDF5_KINDS, require_file, require_folder
 from cnpgen.store.reader import StoredDataset, open_dataset
 from cnpgen.store.scene_table import OBSTACLE_POSES, SCENE_ID
 from cnpgen.store.shard import SHARD_FORMAT
+from cnpgen.store.stated_units import refuse_other_units
 from cnpgen.trajectory.boundary import Boundary, boundary_of
 
 CONTEXT = ("hit_angle", "hit_speed")  # dataset columns that plans keep
@@ -191,11 +194,13 @@ def read_boundary_file(path: Path) -> BoundaryFile:
         attributes = file.attributes.some(SAID)
         columns = {name: file[name].read() for name in ASKED if name in file}
         names = file.names()
-    found = BoundaryFile(path, attributes, columns, has_checksum)
+        found = BoundaryFile(path, attributes, columns, has_checksum)
+        if not has_checksum and not found.is_shard:
+            # Files of cnpgen are complete.
+            refuse_misspelt(path, names, ASKED)
+            refuse_other_units(file, {name: SI_UNITS.get(name, "") for name in ASKED})
+            report_unused(path, file, SAID, ASKED)
     found.check_shard()
-    if not has_checksum and not found.is_shard:
-        # Files of cnpgen are complete.
-        refuse_misspelt(path, names, ASKED)
     missing = [name for name in ("start_q", "goal_q") if name not in columns]
     if missing:
         tasks = any(name.startswith("goal_xyz") for name in names)

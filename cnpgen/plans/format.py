@@ -1,14 +1,17 @@
 """Plan file format: names, units and definitions of its datasets ('cnpgen docs plan-format'), and status of plans."""
 
 import difflib
+import logging
 from collections.abc import Collection
 from enum import IntEnum
 from pathlib import Path
 
-from cnpgen.errors import DatasetError
+from cnpgen.errors import DatasetError, listed
 from cnpgen.store.field import Field
+from cnpgen.store.files.hdf5 import Hdf5
 from cnpgen.store.joint_units import units_of_joints
 from cnpgen.store.scene_table import OBSTACLE_POSES
+from cnpgen.store.stated_units import UNIT_ATTRIBUTES
 
 FORMAT = "cnpgen-plans"
 PLAN_FILE_VERSION = 1
@@ -120,7 +123,19 @@ def plan_fields(
     return fields
 
 
+MAX_LISTED = 12  # unused elements in a message
+# Attributes of datasets that describe them, and units, which are checked.
+_DESCRIBING = {
+    *UNIT_ATTRIBUTES,
+    *("long_name", "names", "frame", "role", "valid_min", "valid_max"),
+    *("flag_values", "flag_meanings"),
+}
+_LOG = logging.getLogger(__name__)
 KNOWN = frozenset(plan_fields((), ()))  # names with a fixed definition
+# Dataset -> SI unit, for joints that of revolute ones; that of parameters differs.
+SI_UNITS = {name: item.unit for name, item in plan_fields(("",), (False,)).items()} | {
+    "parameters": ""
+}
 
 
 def refuse_misspelt(path: Path, names: Collection[str], asked: Collection[str]) -> None:
@@ -135,6 +150,27 @@ def refuse_misspelt(path: Path, names: Collection[str], asked: Collection[str]) 
             raise DatasetError(
                 f"{path}: {name!r} is almost {meant[0]!r}, which the file lacks: rename or remove it"
             )
+
+
+def report_unused(
+    path: Path, file: Hdf5, attributes: Collection[str], names: Collection[str]
+) -> None:
+    """Report the attributes and datasets of a file of other software that are not read; a misspelled attribute is refused.
+
+    The attributes and datasets of the given names are read.
+    """
+    refuse_misspelt(path, [*file.attributes], attributes)
+    unused = [f"attribute {name}" for name in file.attributes if name not in attributes]
+    unused += [name for name in file.names() if name not in names]
+    unused += [
+        f"attribute {key} of {name}"
+        for name in file
+        if name in names
+        for key in file[name].attributes
+        if key not in _DESCRIBING
+    ]
+    if unused:
+        _LOG.info("%s: not used: %s", path, listed(unused, MAX_LISTED))
 
 
 class PlanStatus(IntEnum):

@@ -26,9 +26,11 @@ from cnpgen.plans.format import (
     NOTES,
     PLAN_FILE_VERSION,
     REQUIRED,
+    SI_UNITS,
     PlanStatus,
     plan_fields,
     refuse_misspelt,
+    report_unused,
 )
 from cnpgen.plans.plans import Plans, make_plans
 from cnpgen.plans.tips import correct_tips
@@ -52,6 +54,7 @@ from cnpgen.store.files.hdf5 import Column, Hdf5, create_hdf5, open_hdf5
 from cnpgen.store.files.kind import PLANS
 from cnpgen.store.paths import ANY_HDF5, file_kind, require_file
 from cnpgen.store.shard import field_attributes
+from cnpgen.store.stated_units import refuse_other_units
 from cnpgen.trajectory.boundary import Boundary
 
 
@@ -92,10 +95,12 @@ def load_plans(
         attributes = file.attributes.some((*ATTRIBUTES, *NOTES))
         _check_format(path, attributes)
         columns = _columns(path, file)
-    # Files of cnpgen have the names of the format; others may have misspelled optional
-    # ones.
-    if not has_checksum:
-        refuse_misspelt(path, columns, CONDITIONS)
+        if not has_checksum:
+            # Files of cnpgen have the names and units of the format; others may have
+            # misspelled optional ones.
+            refuse_misspelt(path, columns, CONDITIONS)
+            refuse_other_units(file, SI_UNITS)
+            report_unused(path, file, (*ATTRIBUTES, *NOTES), columns)
     record = agreed_problem(
         path,
         stored_problem(path, attributes, required=wanted is None),

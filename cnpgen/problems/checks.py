@@ -167,8 +167,10 @@ def _robot_errors(raw: ProblemTables) -> Iterator[str]:
     """
     joints = raw.robot.get("joints")
     tip = raw.robot.get("tip")
+    locked = raw.robot.get("locked_joints")
     where = raw.where / "robot"
     planned: list[Any] = joints if isinstance(joints, list) else []
+    placed = [*planned, *(locked if isinstance(locked, list) else [])]
     path = raw.urdf_path
     if path is None:
         return
@@ -199,7 +201,7 @@ def _robot_errors(raw: ProblemTables) -> Iterator[str]:
             yield (where / "joints").message(f"{path.name} has {text}")
     if isinstance(tip, str) and (text := missing_frame(raw.urdf, path, tip)):
         yield (where / "tip").message(text)
-    for name, low, high in _locked_outside(raw.urdf.iter("joint"), planned):
+    for name, low, high in _outside_at_zero(raw.urdf.iter("joint"), placed):
         text = f"{name!r} is not planned and stays at zero, which is outside of its limits [{low:g}, {high:g}]"
         yield (where / "joints").message(text)
 
@@ -354,12 +356,12 @@ def missing_frame(tree: ElementTree.Element, path: Path, name: str) -> str:
     return f"{path.name} has no frame {name!r}{nearest(name, frames)}; its frames: {listed(frames)}"
 
 
-def _locked_outside(
-    joints: Iterable[ElementTree.Element], planned: list[Any]
+def _outside_at_zero(
+    joints: Iterable[ElementTree.Element], placed: list[Any]
 ) -> Iterator[tuple[str, float, float]]:
-    """Return unplanned joints whose limits exclude zero, with the limits.
+    """Return joints without a position of their own whose limits exclude zero, with the limits.
 
-    Mimic joints are omitted.
+    Joints that are planned or locked have one. Mimic joints are omitted.
     """
     for joint in joints:
         limit = joint.find("limit")
@@ -369,7 +371,7 @@ def _locked_outside(
             joint.get("type") in ("revolute", "prismatic")
             and joint.find("mimic") is None
         )
-        if limit is None or not movable or name in planned:
+        if limit is None or not movable or name in placed:
             continue
         # Pinocchio rejects invalid numbers
         with suppress(ValueError):

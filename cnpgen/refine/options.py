@@ -37,7 +37,7 @@ class RefineOptions:
             with a limit above 0 depend on the machine and its load.
 
     Raises:
-        UsageError: A value is invalid.
+        UsageError: A value is invalid, or has no effect beside another one.
     """
 
     objective: str = "time"
@@ -84,6 +84,11 @@ class RefineOptions:
                 "a time limit ends the search with a valid plan, a deadline in any case: choose one",
                 concerns="time_limit",
             )
+        usual = {"tolerance": DEFAULT_SETTINGS.cost_tolerance}
+        for name in ("tolerance", "deadline", "stay_within"):
+            if not self.max_iterations and getattr(self, name) != usual.get(name):
+                text = "has no effect with 0 iterations, which only scale plans in time"
+                raise UsageError(text, argument=name)
         check_range("stay_within", self.stay_within or 0.0, 0.0, MAX_STAY_WITHIN, "rad")
 
     def document(self) -> dict[str, Any]:

@@ -2,7 +2,7 @@
 
 from functools import cache
 
-_PRISMATIC = {
+SLIDING_UNITS = {
     "rad": "m",
     "rad/s": "m/s",
     "rad/s^2": "m/s^2",
@@ -22,7 +22,7 @@ def units_of_joints(revolute_unit: str, is_prismatic: tuple[bool, ...]) -> str:
     "kg m^2" or "N m s/rad".
     """
     units = [
-        _PRISMATIC[revolute_unit] if prismatic else revolute_unit
+        SLIDING_UNITS[revolute_unit] if prismatic else revolute_unit
         for prismatic in is_prismatic
     ]
     # Robots with one kind of joints have one short unit.

@@ -543,3 +543,14 @@ def test_a_killed_solve_keeps_finished_plans(
     assert "exist already" in done.stderr
     assert same(load_plans(out), hits)
     assert not journal.exists()
+
+
+@pytest.mark.parametrize(
+    "options", [{"tolerance": 1e-4}, {"deadline": 0.1}, {"stay_within": 0.1}]
+)
+def test_options_of_iterations_are_refused_without_iterations(
+    options: dict[str, float],
+) -> None:
+    (name,) = options
+    with pytest.raises(UsageError, match=f"{name} has no effect with 0 iterations"):
+        RefineOptions(max_iterations=0, **options)

@@ -129,4 +129,9 @@ def with_joint_limits(arm: Arm, limits: StatedJointLimits) -> Arm:
         )
 
     planned = tuple(map(changed, arm.planned))
-    return replace(arm, planned=planned, doubts=(*arm.doubts, *limits.unused))
+    others = [joint for joint in arm.locked if limits.values.get(joint)]
+    unused = [
+        f"{limits.path.name}: limits of {joint} are not used, since it is not planned"
+        for joint in others
+    ]
+    return replace(arm, planned=planned, doubts=(*arm.doubts, *limits.unused, *unused))

@@ -14,6 +14,7 @@ from __future__ import annotations
 import io
 from collections.abc import Iterator, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -93,17 +94,22 @@ def read_mpinets(
 
 def _check_names(file: Hdf5, account: Account) -> None:
     """Refuse datasets and attributes that are not read; trajectories are unused if there are starts and goals."""
-    entries = accounted(dict.fromkeys((*file.names(), *file.attributes)), account)
     # Starts and goals take precedence, so trajectories beside them are unused.
     ends = next((both for both in _ENDS if all(name in file for name in both)), ())
     trajectory = next((name for name in _TRAJECTORIES if name in file), "")
-    used = [*ends, SCENE_NAMES] if ends else [trajectory, SCENE_NAMES]
+    used = [*ends] if ends else [trajectory]
     for sizes, _, word in _SHAPES.values():
         quaternions = (
             f"{word}_quats" if f"{word}_quats" in file else f"{word}_quaternions"
         )
         used += [*sizes, f"{word}_centers", quaternions]
-    for name in used:
+    names: dict[str, Any] = dict.fromkeys((*file.names(), *file.attributes))
+    # Attributes of datasets, such as a unit or a scale, may change their numbers.
+    names |= {
+        name: dict.fromkeys(file[name].attributes) for name in used if name in file
+    }
+    entries = accounted(names, account)
+    for name in (*used, SCENE_NAMES):
         entries.get(name)
     account.finish(entries)
 

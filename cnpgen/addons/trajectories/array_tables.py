@@ -15,10 +15,10 @@ from cnpgen.plans.format import PHASE_COLUMN
 from cnpgen.robots.parameter_ranges import PARAMETER_UNITS
 from cnpgen.store.files.archives import ArchiveError, read_arrays
 from cnpgen.store.files.hdf5 import open_hdf5
+from cnpgen.store.stated_units import UNIT_ATTRIBUTES
 
 JOINT_NAMES = "joint_names"  # array of an archive, dataset or attribute of HDF5
 MAX_ARCHIVE_BYTES = 1 << 29  # of the arrays of an archive as floats
-UNIT_ATTRIBUTES = "unit", "units"  # of a dataset of HDF5 or a field of Parquet
 # of an array of one plan in an archive of cnpgen
 _PART_OF_ARCHIVE = re.compile(
     rf"(.+?)_(t|{PHASE_COLUMN}|q|dq|ddq|jerk|{'|'.join(PARAMETER_UNITS)})"

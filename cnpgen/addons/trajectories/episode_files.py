@@ -115,6 +115,7 @@ def _read_lerobot(folder: Path) -> Recording:
         version = str(info["codebase_version"])
         features = info["features"]
         names = _feature_names(features[STATE])
+        width = len(_feature_names(features.get(ACTION, {"shape": [len(names)]})))
         robot = str(info.get("robot_type") or "")
     except (ValueError, KeyError, TypeError, IndexError) as error:
         text = (
@@ -139,7 +140,6 @@ def _read_lerobot(folder: Path) -> Recording:
         state = _column(table, STATE, file, len(names))
         action = None
         if ACTION in table.column_names:
-            width = len(_feature_names(features.get(ACTION, {"shape": [len(names)]})))
             action = _column(table, ACTION, file, width)
         for index in dict.fromkeys(number.tolist()):
             rows = number == index
@@ -170,12 +170,15 @@ def _stated_lengths(folder: Path) -> dict[int, int]:
 
 def _feature_names(feature: Any) -> tuple[str, ...]:
     """Return the names of a feature's values: a list, a list in an object, or indices."""
-    width = int(feature["shape"][0])
+    (width,) = map(int, feature["shape"])
     names = feature.get("names")
     if isinstance(names, dict):
-        names = next(iter(names.values()))
+        # Of one kind, such as {"motors": [...]}.
+        (names,) = names.values()
+    if names is None:
+        names = list(range(width))
     if not isinstance(names, list) or len(names) != width:
-        names = range(width)
+        raise ValueError(f"a feature of {width} values has the names {names!r:.60}")
     return tuple(map(str, names))
 
 

@@ -1,7 +1,7 @@
 """Episodes of a LeRobotDataset v3 as tables."""
 
 import re
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -14,8 +14,9 @@ from cnpgen.addons.trajectories.trajectory_table import (
     TrajectoryTable,
     Values,
 )
-from cnpgen.errors import UsageError
+from cnpgen.errors import UsageError, nearest
 from cnpgen.robots.parameter_ranges import PARAMETER_UNITS
+from cnpgen.store.files.accounted import MISSPELT
 from cnpgen.store.files.atomic import read_file
 from cnpgen.store.files.documents import parse_json
 from cnpgen.store.files.size_limits import MAX_TABLE_BYTES
@@ -31,6 +32,15 @@ _INDICES = (
     "index",
     "task_index",
 )
+# Keys of info.json that are read, or describe files and rows that are counted.
+_INFO_KEYS = (
+    *("codebase_version", "features", "fps", "data_path", "total_frames"),
+    *("robot_type", "total_episodes", "total_tasks", "total_chunks", "total_videos"),
+    *("chunks_size", "splits", "video_path"),
+    *("data_files_size_in_mb", "video_files_size_in_mb"),
+)
+# Keys of a feature: the numbers are those of the table, of any type and rate.
+_FEATURE_KEYS = "names", "shape", "dtype", "fps", "info", "video_info"
 _POSE_NAME = re.compile(rf"{OBSTACLE_POSES}(_[0-9]+)?")  # a value of LeRobot
 
 
@@ -69,8 +79,22 @@ def read_lerobot(folder: Path) -> Iterator[TrajectoryTable]:
         if name not in parameters and k not in scene
     ]
     environment_key = [LEROBOT_ENVIRONMENT] if parameters or scene else []
+    unused += _unknown_keys(info, _INFO_KEYS, "info.json", folder)
+    described_columns = key, "timestamp", "episode_index", *environment_key
+    for name in filter(features.__contains__, described_columns):
+        unused += _unknown_keys(features[name], _FEATURE_KEYS, name, folder)
+    pattern, count = info.get("data_path", "data/"), 0
+    if not str(pattern).startswith("data/"):
+        raise UsageError(
+            f"{folder}: data_path must begin with data/, got {pattern!r:.60}"
+        )
     for path in sorted(folder.glob("data/*/*.parquet")):
         table = read_parquet(path)
+        unused += [
+            name
+            for name in table.column_names
+            if name not in features and name not in (*_INDICES, *unused)
+        ]
         needed = (
             "timestamp",
             "episode_index",
@@ -87,6 +111,7 @@ def read_lerobot(folder: Path) -> Iterator[TrajectoryTable]:
         times, episodes, values, *environment = (
             number_column(table, name, path, width) for name, width in columns_of
         )
+        count += len(values)
         for episode in dict.fromkeys(episodes[:, 0].tolist()):
             rows = episodes[:, 0] == episode
             columns: dict[str, Values] = {MESSAGE_TIME: times[rows, 0]}
@@ -97,6 +122,23 @@ def read_lerobot(folder: Path) -> Iterator[TrajectoryTable]:
             place = f"{folder}: episode {episode:g}"
             _check_rate(place, columns[MESSAGE_TIME], info.get("fps"))
             yield TrajectoryTable(place, columns, unused=tuple(unused))
+    if info.get("total_frames", count) != count:
+        stated = info["total_frames"]
+        raise UsageError(
+            f"{folder} has {count:,} frames, info.json states {stated!r:.60}"
+        )
+
+
+def _unknown_keys(
+    described: Mapping[str, Any], known: Sequence[str], of: str, folder: Path
+) -> list[str]:
+    """Return the keys that are not read; UsageError for one that is near a missing key."""
+    missing = [key for key in known if key not in described]
+    unknown = [key for key in described if key not in known]
+    for key in unknown:
+        if hint := nearest(key, missing, similarity=MISSPELT):
+            raise UsageError(f"{folder}: {of} has the unknown key {key!r}{hint}")
+    return [f"attribute {key} of {of}" for key in unknown]
 
 
 def _check_rate(place: str, t: Values, rate: Any) -> None:
@@ -115,16 +157,17 @@ def _feature_names(feature: Any) -> list[str]:
     Raises:
         TypeError, KeyError, ValueError, IndexError: It is no feature.
     """
-    width = int(feature["shape"][0])
-    names = feature.get("names") if isinstance(feature, dict) else None
+    (width,) = map(int, feature["shape"])
+    names = feature.get("names")
     if not 0 < width <= MAX_FEATURE_WIDTH:
         raise ValueError(
             f"a feature has {width} values, expected 1 to {MAX_FEATURE_WIDTH:,}"
         )
     if isinstance(names, dict):
-        names = next(
-            (entry for entry in names.values() if isinstance(entry, list)), None
-        )
-    if isinstance(names, list) and len(names) == width:
-        return [str(name) for name in names]
-    return [f"q{k}" for k in range(width)]
+        # Of one kind, such as {"motors": [...]}.
+        (names,) = names.values()
+    if names is None:
+        return [f"q{k}" for k in range(width)]
+    if not isinstance(names, list) or len(names) != width:
+        raise ValueError(f"a feature of {width} values has the names {names!r:.60}")
+    return [str(name) for name in names]

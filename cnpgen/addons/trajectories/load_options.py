@@ -18,7 +18,8 @@ class LoadOptions:
     Attributes:
         time: Name of the column with the times, and its unit if it has another than s,
             such as "stamp [ms]".
-        unit: Unit of revolute joints in columns without a unit in their name.
+        unit: Unit of revolute joints in columns without a unit in their name; "rad" by
+            default.
         rate: Samples per second [Hz] of a file without times.
         separator: Separator of columns in text files; by default it is found.
         separate_by: Column whose value differs from trajectory to trajectory. A value
@@ -37,7 +38,7 @@ class LoadOptions:
     """
 
     time: str | None = None
-    unit: Literal["rad", "deg"] = "rad"
+    unit: Literal["rad", "deg"] | None = None
     rate: float | None = None
     separator: str | None = None
     separate_by: str | None = None

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from cnpgen.addons.trajectories.array_tables import JOINT_NAMES, UNIT_ATTRIBUTES
+from cnpgen.addons.trajectories.array_tables import JOINT_NAMES
 from cnpgen.addons.trajectories.bag_tables import has_bags
 from cnpgen.addons.trajectories.load_options import LoadOptions
 from cnpgen.addons.trajectories.sampled_trajectory import Trajectory
@@ -38,10 +38,10 @@ from cnpgen.schema.argument_types import checked_arguments
 from cnpgen.schema.old_keywords import with_old_keywords
 from cnpgen.store.dataset_spec import StoredProblem
 from cnpgen.store.files.accounted import MISSPELT, check_allowed, unmatched
+from cnpgen.store.stated_units import SCALE_ATTRIBUTES, UNIT_ATTRIBUTES
 
-# Elements beside columns that say what their numbers mean, and attributes of HDF5 that do.
+# Elements beside columns that say what their numbers mean.
 _OF_NAMES = "joint_name", "joints", "names", "unit", "units"
-_OF_NUMBERS = "scale", "scale_factor", "offset", "add_offset"
 
 
 @dataclass(frozen=True, eq=False)
@@ -140,7 +140,10 @@ def load_trajectories(
     if chosen.topic is not None and not has_bags(Path(path)):
         text = f"is for bags of ROS, got {path}, which is none"
         raise UsageError(text, argument="topic")
-    if chosen.unit == "rad":
+    if chosen.unit is not None and not any(reader.lacks_unit for reader in readers):
+        text = "is for columns without a unit: all columns of joints state theirs"
+        raise UsageError(text, argument="unit")
+    if chosen.unit != "deg":
         _check_unit(path, robot, [trajectory.q for trajectory in trajectories])
     for reader, trajectory in zip(readers, trajectories, strict=True):
         reader.check_units(trajectory)
@@ -184,7 +187,7 @@ def _check_meaning(
     for name in ignored:
         key = _key_of(name)
         is_attribute = name.startswith("attribute ")
-        known = {*_OF_NAMES, *_OF_NUMBERS} if is_attribute else _OF_NAMES
+        known = {*_OF_NAMES, *SCALE_ATTRIBUTES} if is_attribute else _OF_NAMES
         similar = nearest(key, (JOINT_NAMES, *UNIT_ATTRIBUTES), similarity=MISSPELT)
         if (key in known or similar) and key not in allowed:
             text = (

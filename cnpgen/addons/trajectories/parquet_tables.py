@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from cnpgen.addons.trajectories.array_tables import UNIT_ATTRIBUTES, with_units
+from cnpgen.addons.trajectories.array_tables import with_units
 from cnpgen.addons.trajectories.load_options import LoadOptions
 from cnpgen.addons.trajectories.text_tables import text_array
 from cnpgen.addons.trajectories.trajectory_table import TrajectoryTable, Values
@@ -15,6 +15,7 @@ from cnpgen.errors import UsageError, requires_extra
 from cnpgen.plans.format import JOINT_NAMES_KEY, PLAN_COLUMN
 from cnpgen.store.files.atomic import read_file
 from cnpgen.store.files.size_limits import MAX_TABLE_BYTES, MAX_TEXT_ARRAY_BYTES
+from cnpgen.store.stated_units import UNIT_ATTRIBUTES
 
 MAX_PARQUET_VALUES = (
     25_000_000  # of a table: they take up to 50 bytes each while it is read

@@ -60,7 +60,8 @@ class TableReader:
     """Reader of one trajectory of a table.
 
     ``used`` has the names of the columns that were read, ``notes`` sentences about how,
-    ``other_joints`` the joints of arrays that the problem does not plan.
+    ``other_joints`` the joints of arrays that the problem does not plan, ``lacks_unit`` whether a column of
+    revolute joints states no unit.
     """
 
     table: TrajectoryTable
@@ -70,6 +71,7 @@ class TableReader:
     used: set[str] = field(default_factory=set)
     notes: list[str] = field(default_factory=list)
     other_joints: list[str] = field(default_factory=list)
+    lacks_unit: bool = False
 
     def trajectory(self) -> Trajectory:
         """Return the trajectory; its parameters are None if some are missing."""
@@ -439,7 +441,10 @@ class TableReader:
         units = [
             ("m", 1.0) if slides else turning for slides in self.record.prismatic_joints
         ]
-        parts = zip(names, units, strict=True)
+        parts = list(zip(names, units, strict=True))
+        self.lacks_unit |= any(
+            stated_factor(name) is None and unit == "rad" for name, (unit, _) in parts
+        )
         return np.array(
             [
                 self._factor(name, unit + exponent, usual)

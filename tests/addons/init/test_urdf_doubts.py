@@ -10,9 +10,11 @@ import pytest
 from cnpgen.addons.init.arm import arm_notes, read_arm
 from cnpgen.addons.init.initial_recipes import InitialProblem, problem_of
 from cnpgen.addons.init.joint_limits import read_joint_limits, with_joint_limits
+from cnpgen.addons.init.write import problem_text
 from cnpgen.cli.main import main
 from cnpgen.errors import RecipeError, UsageError
 from cnpgen.problems.load_robot import load_robot
+from cnpgen.problems.problem_file import load_problem
 from cnpgen.robots.robot import Robot
 from cnpgen.robots.urdf import urdf_tree
 from cnpgen.robots.urdf_changes import SRDF_NAMES
@@ -137,6 +139,20 @@ def test_a_locked_joint_moves_to_the_limit_nearest_to_zero(tmp_path: Path) -> No
     }
     inside = write(tmp_path / "b.urdf", more=finger())
     assert initial(inside).problem.robot.locked_joints == ()
+
+
+def test_a_recipe_with_a_locked_joint_that_cannot_be_at_zero_is_read(
+    tmp_path: Path,
+) -> None:
+    made = initial(write(tmp_path / "a.urdf", more=finger(low=0.3)))
+    file = tmp_path / "arm" / "problem.toml"
+    file.parent.mkdir()
+    text = problem_text(made, file.parent)
+    file.write_text(text)
+    assert load_problem(file).robot.locked_positions == (0.3,)
+    file.write_text(re.sub("locked_(joints|positions) = .*", "", text))
+    with pytest.raises(RecipeError, match="'g1' is not planned and stays at zero"):
+        load_problem(file)
 
 
 def test_followers_of_a_locked_joint_have_their_offset(tmp_path: Path) -> None:
@@ -297,6 +313,16 @@ def test_limits_of_moveit_replace_those_of_the_urdf(tmp_path: Path) -> None:
     notes = "\n".join(arm_notes(arm))
     assert "j2: max_velocity is not used, since has_velocity_limits is not" in notes
     assert "limits.yaml: default_velocity_scaling_factor is not used" in notes
+
+
+def test_limits_of_joints_that_are_not_planned_are_listed(tmp_path: Path) -> None:
+    pytest.importorskip("yaml")
+    file = tmp_path / "limits.yaml"
+    file.write_text(LIMITS.replace("  j2:", "  g1:"))
+    arm = read_arm(write(tmp_path / "a.urdf", more=finger()), "wrist")
+    limits = read_joint_limits(file, ("j1", "j2", "g1"))
+    notes = "\n".join(arm_notes(with_joint_limits(arm, limits)))
+    assert "limits.yaml: limits of g1 are not used, since it is not planned" in notes
 
 
 @pytest.mark.parametrize(

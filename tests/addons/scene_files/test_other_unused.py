@@ -164,6 +164,17 @@ def test_unknown_datasets_of_hdf5_files_are_refused(
     assert "not used: global_solutions" in caplog.text
 
 
+@pytest.mark.parametrize("name", ["cuboid_dims", "cuboid_quaternions", "start_q"])
+def test_attributes_of_datasets_are_refused(tmp_path: Path, name: str) -> None:
+    file = hdf5(tmp_path)
+    with h5py.File(file, "a") as content:
+        content[name].attrs["unit"] = "mm"
+    with pytest.raises(SceneError, match=rf"unknown element, {name}\.unit"):
+        load_scenes(file)
+    scenes = load_scenes(file, allow_unused=["unit"])
+    assert scenes[0].request.accepted == (f"{name}.unit",)
+
+
 def test_observations_need_one_frame(tmp_path: Path) -> None:
     scene = load(tmp_path, PROBLEM)
     assert observe([scene], "tokens")["mask"].sum() == 3

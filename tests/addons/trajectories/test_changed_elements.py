@@ -298,3 +298,18 @@ def test_options_that_nothing_needs_are_refused(tmp_path: Path) -> None:
     ):
         with pytest.raises(UsageError, match=text):
             load_trajectories(file, "airhockey", options=LoadOptions(**options))
+
+
+@pytest.mark.parametrize("unit", ["rad", "deg"])
+def test_a_unit_is_refused_where_all_columns_state_theirs(
+    tmp_path: Path, unit: Any
+) -> None:
+    head = ",".join(["t [s]", *(f"{joint} [rad]" for joint in JOINTS)])
+    rows = np.column_stack([T, Q])
+    path = tmp_path / "a.csv"
+    np.savetxt(path, rows, "%.17g", ",", header=head, comments="")
+    with pytest.raises(UsageError, match="unit is for columns without a unit"):
+        load_trajectories(path, "airhockey", options=LoadOptions(unit=unit))
+    head = head.replace("joint_2 [rad]", "joint_2")
+    np.savetxt(path, rows, "%.17g", ",", header=head, comments="")
+    load_trajectories(path, "airhockey", options=LoadOptions(unit="rad"))

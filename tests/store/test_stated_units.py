@@ -1,0 +1,95 @@
+"""Attributes of files of other software: units, scales and misspelt names are refused, others are listed."""
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+import pytest
+
+from cnpgen.errors import DatasetError
+from cnpgen.make.complete import read_tasks
+from cnpgen.plans.boundary_problems import load_boundary_problems
+from cnpgen.plans.plan_file import load_plans
+from cnpgen.store.field import Field
+
+Q = np.tile([0.0, 0.1, 0.0, -0.5, 0.0, 0.7], (2, 1))
+COLUMNS = {
+    "start_q": Q,
+    "goal_q": Q + 0.1,
+    **dict.fromkeys(("start_dq", "start_ddq", "goal_dq"), 0.0 * Q),
+    "path_control_points": np.tile(Q[:, None], (1, 15, 1)),
+    "rate_control_points": np.ones((2, 20)),
+}
+TASKS = {"goal_xyz": Field("goal_xyz", "m", "goal", 3, ("x", "y", "z"))}
+READERS: dict[str, tuple[dict[str, Any], Callable[[Path], Any]]] = {
+    "plans": (COLUMNS, lambda path: load_plans(path, problem="airhockey")),
+    "boundary": (
+        {name: COLUMNS[name] for name in ("start_q", "goal_q")},
+        lambda path: load_boundary_problems(path, problem="airhockey"),
+    ),
+    "tasks": (
+        {"goal_xyz": np.ones((2, 3))},
+        lambda path: read_tasks(path, TASKS, flat=False),
+    ),
+}
+
+
+def write(path: Path, columns: dict[str, Any]) -> h5py.File:
+    file = h5py.File(path, "w")
+    for name, values in columns.items():
+        file[name] = values
+    return file
+
+
+@pytest.mark.parametrize(
+    ("key", "value"),
+    [("unit", "deg"), ("units", "mm"), ("units", "s"), ("scale", 2.0), ("offset", 0.1)],
+)
+@pytest.mark.parametrize("kind", READERS)
+def test_attributes_that_change_numbers_are_refused(
+    tmp_path: Path, kind: str, key: str, value: Any
+) -> None:
+    columns, read = READERS[kind]
+    name = next(iter(columns))
+    with write(tmp_path / "a.h5", columns) as file:
+        file[name].attrs[key] = value
+    with pytest.raises(DatasetError, match=f"the attribute '{key}' of {name} states"):
+        read(tmp_path / "a.h5")
+
+
+@pytest.mark.parametrize("kind", READERS)
+def test_attributes_that_state_si_units_are_accepted(tmp_path: Path, kind: str) -> None:
+    columns, read = READERS[kind]
+    unit = "m" if kind == "tasks" else "rad"
+    with write(tmp_path / "a.h5", columns) as file:
+        file[next(iter(columns))].attrs["unit"] = unit
+    assert len(read(tmp_path / "a.h5")) > 0
+
+
+@pytest.mark.parametrize("kind", ["plans", "boundary"])
+def test_attributes_that_are_not_read_are_listed_or_refused(
+    tmp_path: Path, kind: str, caplog: pytest.LogCaptureFixture
+) -> None:
+    columns, read = READERS[kind]
+    with write(tmp_path / "a.h5", columns) as file:
+        file.attrs["rate"] = 50.0
+        file["start_q"].attrs["epoch"] = "1970"
+    caplog.set_level("INFO", "cnpgen")
+    read(tmp_path / "a.h5")
+    assert "not used: attribute rate, attribute epoch of start_q" in caplog.text
+    with h5py.File(tmp_path / "a.h5", "a") as file:
+        file.attrs["degre"] = 5
+    with pytest.raises(DatasetError, match="'degre' is almost 'degree'"):
+        read(tmp_path / "a.h5")
+
+
+def test_datasets_beside_boundary_conditions_are_listed(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    columns, read = READERS["boundary"]
+    write(tmp_path / "a.h5", columns | {"velocity_limits": Q}).close()
+    caplog.set_level("INFO", "cnpgen")
+    read(tmp_path / "a.h5")
+    assert "not used: velocity_limits" in caplog.text
