@@ -12,7 +12,6 @@ that are missing. The interpreter of a checkout is its .venv/bin/python.
 import argparse
 import json
 import os
-import resource
 import shutil
 import subprocess
 import time
@@ -22,14 +21,21 @@ from pathlib import Path
 HERE = Path(__file__).parents[1]
 COMMANDS = {
     "make-dataset airhockey-hit": "make-dataset airhockey-hit --n 400 -o OUT/hits --workers 1",
+    "make-dataset airhockey-replan": "make-dataset airhockey-replan --n 400 -o OUT/replans --workers 1",
+    "make-dataset heavy-object-anywhere": "make-dataset heavy-object-anywhere --n 400 -o OUT/anywhere --workers 1",
     "plan airhockey-hit": "plan INPUTS/hits --model airhockey-hit --n 4 -o OUT/plans.h5",
+    "evaluate": "evaluate INPUTS/plans.h5",
     "refine": "refine INPUTS/plans.h5 -o OUT/refined.h5",
     "solve airhockey-hit": "solve airhockey-hit --n 4 -o OUT/solved.h5",
     "solve heavy-object": "solve heavy-object --n 4 -o OUT/solved.h5",
     "solve clutter": "solve datasets/suites/clutter.h5 --robot panda-3kg --n 3 -o OUT/solved.h5",
+    "solve turret": "solve INPUTS/turret/pipeline.toml --n 4 -o OUT/solved.h5",
     "solve an arm by init": "solve INPUTS/arm/pipeline.toml --n 4 -o OUT/solved.h5",
+    "train, 20 steps": "train INPUTS/hits --steps 20 -o OUT/model.h5",
 }  # fmt: skip
 ARM = "init OUT/arm --urdf problems/heavy-object/iiwa14_object.urdf"
+TURRET = "init OUT/turret --urdf INPUTS/turret.urdf --tip tool"
+TUTORIAL = HERE / "docs/tutorials/your-arm.md"  # contains the turret's URDF
 MAX_BACKGROUND_S = 300
 POLL_INTERVAL_S = 0.05
 
@@ -41,7 +47,6 @@ def run(tree: Path, command: str, folder: Path, cache: Path) -> dict[str, float]
     words = command.replace("OUT", str(folder / "out"))
     words = words.replace("INPUTS", str(folder / "inputs"))
     variables = {**os.environ, "CNPGEN_CACHE": str(cache), "OMP_NUM_THREADS": "1"}
-    before = resource.getrusage(resource.RUSAGE_CHILDREN)
     process = subprocess.Popen(
         [tree / ".venv/bin/python", "-m", "cnpgen", *words.split(), "--quiet"],
         env=variables,
@@ -49,15 +54,18 @@ def run(tree: Path, command: str, folder: Path, cache: Path) -> dict[str, float]
         stdout=subprocess.DEVNULL,
     )
     background, waited_for = dict[int, float](), set[int]()
-    while process.poll() is None:
+    # The usage is that of this command alone; RUSAGE_CHILDREN has the memory of all before.
+    ended, status, usage = os.wait4(process.pid, os.WNOHANG)
+    while not ended:
         background |= background_times(cache)
         # The command has waited for these: their times count as its own.
         waited_for = {each for each in background if not Path(f"/proc/{each}").exists()}
         time.sleep(POLL_INTERVAL_S)
+        ended, status, usage = os.wait4(process.pid, os.WNOHANG)
+    process.returncode = os.waitstatus_to_exitcode(status)
     if process.returncode:
         raise SystemExit(f"{command}: exit code {process.returncode}")
-    after = resource.getrusage(resource.RUSAGE_CHILDREN)
-    times = after.ru_utime - before.ru_utime + after.ru_stime - before.ru_stime
+    times = usage.ru_utime + usage.ru_stime
     times -= sum(background[each] for each in waited_for)
     begun = time.monotonic()
     while running := background_times(cache):
@@ -68,7 +76,7 @@ def run(tree: Path, command: str, folder: Path, cache: Path) -> dict[str, float]
     return {
         "cpu": times,
         "background": sum(background.values()),
-        "memory": after.ru_maxrss / 1000,
+        "memory": usage.ru_maxrss / 1000,
     }
 
 
@@ -98,12 +106,15 @@ def measure(tree: Path, command: str, folder: Path) -> dict[str, float]:
 def make_inputs(folder: Path) -> None:
     """Make the dataset, plans and recipes that commands read, with a cache of their own."""
     inputs = folder / "inputs"
-    if not (inputs / "arm").exists():
+    if not (inputs / "turret").exists():
         shutil.rmtree(inputs, ignore_errors=True)
         inputs.mkdir(parents=True)
+        text = TUTORIAL.read_text(encoding="utf-8")
+        turret = text[text.index("<robot") : text.index("END\n```")]
+        (inputs / "turret.urdf").write_text(turret, encoding="utf-8")
         names = "make-dataset airhockey-hit", "plan airhockey-hit"
         cache = folder / "cache-of-inputs"
-        for command in (*(COMMANDS[name] for name in names), ARM):
+        for command in (*(COMMANDS[name] for name in names), ARM, TURRET):
             run(HERE, command.replace("OUT", str(inputs)), folder, cache)
 
 
