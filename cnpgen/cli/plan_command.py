@@ -112,10 +112,7 @@ def run(arguments: argparse.Namespace) -> int:
     # No plans have no mean, which is null in JSON.
     duration = float(plans.duration.mean()) if len(plans) else None
     if not arguments.quiet:
-        text = f"{counted(len(plans), 'plan')} in {1e3 * seconds:.1f} ms"
-        if duration is not None:
-            text += f", {1e6 * seconds / len(plans):.0f} us each, mean motion time {duration:.3f} s"
-        print(text, file=sys.stderr)
+        print(_summary(len(plans), seconds, duration), file=sys.stderr)
     if arguments.refine:
         title = f"refining plans of {arguments.model}"
         return refine_and_save(arguments, plans, out, title=title)
@@ -125,6 +122,14 @@ def run(arguments: argparse.Namespace) -> int:
     facts |= {"mean_duration_s": duration}
     print(json.dumps(facts, indent=2) if arguments.json else out)
     return 0
+
+
+def _summary(count: int, seconds: float, duration: float | None) -> str:
+    """Return the times of planning and of the motions in a sentence."""
+    text = f"{counted(count, 'plan')} in {1e3 * seconds:.1f} ms"
+    if duration is None:
+        return text
+    return f"{text}, {1e6 * seconds / count:.0f} us each, mean motion time {duration:.3f} s"
 
 
 def _request(arguments: argparse.Namespace, requests: "Requests") -> list[Any]:

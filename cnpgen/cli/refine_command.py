@@ -10,6 +10,7 @@ import argparse
 import json
 import sys
 import textwrap
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -144,17 +145,13 @@ def refine_and_save(
     ``make`` is ``refine_plans`` by default, ``solve_plans``, or a function that solves
     scenes and has no plans; then ``request`` is all that these depend on.
     """
-    import joblib
-
     from cnpgen.cli.finished import is_finished, record_request
     from cnpgen.plans import save_plans
-    from cnpgen.refine.refine_plans import identity_of_run, refine_plans
+    from cnpgen.refine.refine_plans import refine_plans
 
     options = _refine_options(arguments)
     if plans is not None:
-        # Columns without effect on the refined motions are kept in the result.
-        kept = joblib.hash([plans.columns, plans.sample_id])
-        request = [identity_of_run(plans, options), kept]
+        request = _identity(plans, options)
     name = make.__name__ if make is not None and plans is not None else ""
     request = [request, name, options.document()]
     if is_finished(out, request, force=arguments.force):
@@ -162,39 +159,60 @@ def refine_and_save(
     check_place(out)
     # The journal keeps finished plans until the output is complete.
     journal = out.with_name(out.name + ".part")
-    finished = [0, 0]
-
-    def progress(plans: int, valid: int) -> None:
-        finished[0], finished[1] = finished[0] + plans, finished[1] + valid
-        meter(plans)
-        meter.note(f"{finished[1] / finished[0]:.1%} valid")
-
-    run: Callable[..., Refinement | SolvedScenes] = make or refine_plans
+    # ``discard`` applies to the journal of another request.
+    settings = {"options": options, "journal": journal, "discard": arguments.force}
+    settings |= options_of(arguments, *ENGINE)
+    chosen: Callable[..., Refinement | SolvedScenes] = make or refine_plans
+    run = partial(chosen, plans, **settings)
     with resumable(journal), Meter(quiet=arguments.quiet, noun="plan") as meter:
-        # ``discard`` applies to the journal of another request.
-        found = run(
-            plans,
-            options=options,
-            journal=journal,
-            discard=arguments.force,
-            begin=lambda total, there: meter.begin(title, total, there),
-            progress=progress,
-            **options_of(arguments, *ENGINE),
-        )
+        found = _run_with_meter(run, meter, title)
         facts = found.summary()
-        if arguments.explain and any(
-            "finding" not in failure for failure in facts["not_valid"]
-        ):
+        if arguments.explain:
             _explain(facts, found, meter)
     save_plans(out, found.plans)
     record_request(out, request)
     # The journal is removed last: until then the same command can resume from it.
     journal.unlink(missing_ok=True)
+    _print_result(arguments, out, facts, found.times)
+    return 0 if found.valid.all() else 1
+
+
+def _identity(plans: "Plans", options: "RefineOptions") -> list[str]:
+    """Return what identifies a run and the columns of its result."""
+    import joblib
+
+    from cnpgen.refine.refine_plans import identity_of_run
+
+    # Columns without effect on the refined motions are kept in the result.
+    kept = joblib.hash([plans.columns, plans.sample_id])
+    return [identity_of_run(plans, options), kept]
+
+
+def _print_result(
+    arguments: argparse.Namespace, out: Path, facts: dict[str, Any], times: "Times"
+) -> None:
+    """Print a summary on stderr, and the file or JSON on stdout."""
     if not arguments.quiet:
         listed = facts["plans"] if arguments.explain else LISTED
-        print("\n".join(_summary(facts, found.times, listed=listed)), file=sys.stderr)
+        print("\n".join(_summary(facts, times, listed=listed)), file=sys.stderr)
     print(json.dumps({"file": str(out), **facts}, indent=2) if arguments.json else out)
-    return 0 if found.valid.all() else 1
+
+
+def _run_with_meter(
+    run: "Callable[..., Refinement | SolvedScenes]", meter: Meter, title: str
+) -> "Refinement | SolvedScenes":
+    """Run with progress on a meter; return the result."""
+    finished = [0, 0]
+
+    def progress(plans: int, valid: int) -> None:
+        finished[0] += plans
+        finished[1] += valid
+        meter(plans)
+        meter.note(f"{finished[1] / finished[0]:.1%} valid")
+
+    return run(
+        begin=lambda total, there: meter.begin(title, total, there), progress=progress
+    )
 
 
 def _refine_options(arguments: argparse.Namespace) -> "RefineOptions":
@@ -247,9 +265,11 @@ def check_place(out: Path) -> None:
 def _explain(
     facts: dict[str, Any], found: "Refinement | SolvedScenes", meter: Meter
 ) -> None:
-    """Add proofs of infeasibility to the results of invalid plans."""
+    """Add proofs of infeasibility to the results of invalid plans, unless all have one."""
     from cnpgen.refine.proof.explain import explain_plans
 
+    if all("finding" in failure for failure in facts["not_valid"]):
+        return
     meter.begin("explaining", len(facts["not_valid"]))
     for failure in facts["not_valid"]:
         (finding,) = explain_plans(found.plans, [failure["plan"]]).values()

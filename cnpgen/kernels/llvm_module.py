@@ -17,7 +17,7 @@ from cnpgen.kernels.kernel import axis_names
 from cnpgen.kernels.llvm_text import CONSTANTS, PAD, StepText
 from cnpgen.kernels.lowering import lower, uniform_arguments
 from cnpgen.kernels.steps import ArithmeticStep
-from cnpgen.kernels.tape import Tape
+from cnpgen.kernels.tape import Axes, Loop, Tape
 
 ONCE = "i64 %n, ptr %in, ptr %ld, ptr %out"
 GRID = "i64 %nodes, i64 %n, ptr %in, ptr %ld, ptr %out, ptr %lo"
@@ -134,9 +134,6 @@ ret void
 
 def _iterated_lanes(tape: Tape, steps: list[ArithmeticStep], text: StepText) -> str:
     """Return the function that iterates full vectors of lanes; converged lanes keep their values."""
-    assert tape.loop is not None
-    vector = text.vector
-    flags = text.flags
     width = tape.inputs[0]
     # State and parameters are loaded once; only the state changes between steps.
     names = {
@@ -146,9 +143,41 @@ def _iterated_lanes(tape: Tape, steps: list[ArithmeticStep], text: StepText) -> 
     }
     loads = "\n".join(
         _address(f"a{a}_{c}", f"%in{a} %ld{a}", c, "%k")
-        + f"{name} = load {vector}, ptr %a{a}_{c}, align {text.size}"
+        + f"{name} = load {text.vector}, ptr %a{a}_{c}, align {text.size}"
         for (a, c), name in names.items()
     )
+    stores = "\n".join(
+        _address(f"end{i}", "%out0 %lo0", i, "%k")
+        + f"store {text.vector} %next{i}, ptr %end{i}, align {text.size}"
+        for i in range(width)
+    )
+    return f"""{_head(tape, text)}
+block:
+%k = phi i64 [0, %entry], [%k1, %finished]
+{loads}
+br label %step
+{_iteration(tape, steps, text, names)}
+finished:
+{stores}
+{_address("enderror", "%out1 %lo1", 0, "%k")}
+store {text.vector} %error1, ptr %enderror, align {text.size}
+%k1 = add i64 %k, {text.size * text.lanes}
+%more = icmp ult i64 %k1, %end
+br i1 %more, label %block, label %done
+done:
+ret void
+}}"""
+
+
+def _iteration(
+    tape: Tape,
+    steps: list[ArithmeticStep],
+    text: StepText,
+    names: dict[tuple[int, int], str],
+) -> str:
+    """Return the block of one step of the iteration, from the loaded state and parameters."""
+    assert tape.loop is not None
+    vector = text.vector
     results: dict[tuple[int, int], str] = {}
 
     def read(_: int, name: str, argument: int, component: int) -> str:
@@ -160,57 +189,41 @@ def _iterated_lanes(tape: Tape, steps: list[ArithmeticStep], text: StepText) -> 
         return ""
 
     body = text.body(steps, read, write)
-    # SSA form: the state is a phi of its loaded value and the value after the last
-    # step.
-    states = "\n".join(
-        f"%state{i} = phi {vector} [{names[0, i]}, %block], [%next{i}, %step]"
-        for i in range(width)
-    )
-    # next = active ? step(state) : state. The comparison uses the error of the state
-    # before the step, so that a lane takes one more step after the tolerance is met.
-    choices = "\n".join(
-        f"%next{i} = select {flags} %active, {vector} {results[0, i]}, {vector} %state{i}"
-        for i in range(width)
-    )
-    stores = "\n".join(
-        _address(f"end{i}", "%out0 %lo0", i, "%k")
-        + f"store {vector} %next{i}, ptr %end{i}, align {text.size}"
-        for i in range(width)
-    )
-    error = results[1, 0]
-    tolerance = text.number(tape.loop.tolerance)
-    return f"""{_head(tape, text)}
-block:
-%k = phi i64 [0, %entry], [%k1, %finished]
-{loads}
-br label %step
-step:
+    states = []
+    choices = []
+    for i in range(tape.inputs[0]):
+        # SSA form: the state is a phi of its loaded value and the value after the last
+        # step.
+        initial = names[0, i]
+        states.append(
+            f"%state{i} = phi {vector} [{initial}, %block], [%next{i}, %step]"
+        )
+        # next = active ? step(state) : state. The comparison uses the error of the
+        # state before the step, so that a lane takes one more step after the tolerance
+        # is met.
+        values = f"{vector} {results[0, i]}, {vector} %state{i}"
+        choices.append(f"%next{i} = select {text.flags} %active, {values}")
+    head = f"""step:
 %count = phi i64 [0, %block], [%count1, %step]
-%active = phi {flags} [splat (i1 true), %block], [%remaining, %step]
-%error = phi {vector} [zeroinitializer, %block], [%error1, %step]
-{states}
-{body}
-{choices}
-%error1 = select {flags} %active, {vector} {error}, {vector} %error
-%converged = fcmp olt {vector} {error}, {tolerance}
+%active = phi {text.flags} [splat (i1 true), %block], [%remaining, %step]
+%error = phi {vector} [zeroinitializer, %block], [%error1, %step]"""
+    end = _end_of_step(tape.loop, text, results[1, 0])
+    return "\n".join([head, *states, body, *choices, end])
+
+
+def _end_of_step(loop: Loop, text: StepText, error: str) -> str:
+    """Return the end of a step: it is repeated while a lane has not converged."""
+    flags = text.flags
+    return f"""%error1 = select {flags} %active, {text.vector} {error}, {text.vector} %error
+%converged = fcmp olt {text.vector} {error}, {text.number(loop.tolerance)}
 %open = xor {flags} %converged, splat (i1 true)
 %remaining = and {flags} %active, %open
 %bits = bitcast {flags} %remaining to i{text.lanes}
 %any = icmp ne i{text.lanes} %bits, 0
 %count1 = add i64 %count, 1
-%below = icmp slt i64 %count1, {tape.loop.limit}
+%below = icmp slt i64 %count1, {loop.limit}
 %again = and i1 %any, %below
-br i1 %again, label %step, label %finished
-finished:
-{stores}
-{_address("enderror", "%out1 %lo1", 0, "%k")}
-store {vector} %error1, ptr %enderror, align {text.size}
-%k1 = add i64 %k, {text.size * text.lanes}
-%more = icmp ult i64 %k1, %end
-br i1 %more, label %block, label %done
-done:
-ret void
-}}"""
+br i1 %again, label %step, label %finished"""
 
 
 def _summed(tape: Tape) -> set[int]:
@@ -240,7 +253,6 @@ def _tail(tape: Tape, lanes: int, real: str) -> str:
     # Copies are packed: every row has as many lanes as a vector, whatever its stride
     # was.
     uniform = uniform_arguments(tape)
-    summed = _summed(tape)
     position = 0
     for i, width in enumerate(tape.inputs):
         lines.append(_copied("in", "ld", i, f"inputs, i64 {position}", real))
@@ -250,31 +262,38 @@ def _tail(tape: Tape, lanes: int, real: str) -> str:
             lines.append(
                 f"call void @pad(ptr %inc{i}, ptr %inf{i}, i64 %ld{i}, i64 {width}, i64 %rest)"
             )
-        pointer, stride = (
-            (f"%in{i}", f"%ld{i}") if i in uniform else (f"%inc{i}", lanes)
-        )
+        entry = f"%in{i}", f"%ld{i}"
+        pointer, stride = entry if i in uniform else (f"%inc{i}", lanes)
         lines.append(
             f"store ptr {pointer}, ptr %int{i}\nstore i64 {stride}, ptr %ldt{i}"
         )
         position += width * lanes
+    before, after = _copied_results(tape, lanes, real)
+    call = f"call void @lanes(i64 {lanes}, ptr %in_, ptr %ld_, ptr %out_, ptr %lo_)"
+    return "\n".join([*lines, *before, call, *after, "ret void", "}"])
+
+
+def _copied_results(tape: Tape, lanes: int, real: str) -> tuple[list[str], list[str]]:
+    """Return what prepares the copies of results, and what copies them back."""
+    summed = _summed(tape)
+    before = []
+    after = []
     position = 0
-    copies = []
     for i, width in enumerate(tape.outputs):
-        lines.append(_copied("out", "lo", i, f"results, i64 {position}", real))
+        before.append(_copied("out", "lo", i, f"results, i64 {position}", real))
         # Sums are read before they are written, so their lanes are copied in as well.
         if i in summed:
-            lines.append(
+            before.append(
                 f"call void @pad(ptr %outc{i}, ptr %outf{i}, i64 %lo{i}, i64 {width}, i64 %rest)"
             )
-        lines.append(
+        before.append(
             f"store ptr %outc{i}, ptr %outt{i}\nstore i64 {lanes}, ptr %lot{i}"
         )
-        copies.append(
+        after.append(
             f"call void @unpad(ptr %outf{i}, i64 %lo{i}, ptr %outc{i}, i64 {width}, i64 %rest)"
         )
         position += width * lanes
-    call = f"call void @lanes(i64 {lanes}, ptr %in_, ptr %ld_, ptr %out_, ptr %lo_)"
-    return "\n".join([*lines, call, *copies, "ret void", "}"])
+    return before, after
 
 
 def _copied(name: str, strides: str, i: int, place: str, real: str) -> str:
@@ -332,26 +351,10 @@ def _grid_kernel(tape: Tape, real: str) -> str:
     axes = (*tape.grid.arguments, *tape.grid.results)
     rows = [("in", "ld", i) for i in range(inputs)]
     rows += [("out", "lo", i) for i in range(outputs)]
-    # The strides between components are equal for all nodes: store them once, and move
-    # only the pointers from node to node.
-    before = []
-    inside = []
-    for (name, strides, i), kind in zip(rows, axes, strict=True):
-        before.append(
-            f"%{name}p{i} = getelementptr ptr, ptr %{name}, i64 {i}\n%{name}b{i} = load ptr, ptr %{name}p{i}\n"
-            f"%{strides}p{i} = getelementptr i64, ptr %{strides}, i64 {2 * i}\n"
-            f"%{strides}v{i} = load i64, ptr %{strides}p{i}\n"
-            f"%{strides}t{i} = getelementptr i64, ptr %{strides}_, i64 {i}\nstore i64 %{strides}v{i}, ptr %{strides}t{i}\n"
-            f"%{strides}q{i} = getelementptr i64, ptr %{strides}, i64 {2 * i + 1}\n"
-            f"%{strides}n{i} = load i64, ptr %{strides}q{i}\n"
-            f"%{name}t{i} = getelementptr ptr, ptr %{name}_, i64 {i}"
-        )
-        # An argument without a node axis is read again at the same address.
-        stride = f"%{strides}n{i}" if "nodes" in axis_names(kind) else "0"
-        inside.append(
-            f"%{name}o{i} = mul i64 %k, {stride}\n%{name}x{i} = getelementptr {real}, ptr %{name}b{i}, i64 %{name}o{i}\n"
-            f"store ptr %{name}x{i}, ptr %{name}t{i}"
-        )
+    before = [_row_of_grid(*row) for row in rows]
+    inside = [
+        _row_of_node(*row, kind, real) for row, kind in zip(rows, axes, strict=True)
+    ]
     return f"""define void @kernel({GRID}) {{
 entry:
 %in_ = alloca [{max(inputs, 1)} x ptr]
@@ -371,3 +374,30 @@ br i1 %more, label %node, label %done
 done:
 ret void
 }}"""
+
+
+def _row_of_grid(name: str, strides: str, i: int) -> str:
+    """Return the loads of a pointer and its strides before the loop over nodes.
+
+    The strides between components are equal for all nodes: they are stored once, and only
+    the pointers move from node to node.
+    """
+    return (
+        f"%{name}p{i} = getelementptr ptr, ptr %{name}, i64 {i}\n%{name}b{i} = load ptr, ptr %{name}p{i}\n"
+        f"%{strides}p{i} = getelementptr i64, ptr %{strides}, i64 {2 * i}\n"
+        f"%{strides}v{i} = load i64, ptr %{strides}p{i}\n"
+        f"%{strides}t{i} = getelementptr i64, ptr %{strides}_, i64 {i}\nstore i64 %{strides}v{i}, ptr %{strides}t{i}\n"
+        f"%{strides}q{i} = getelementptr i64, ptr %{strides}, i64 {2 * i + 1}\n"
+        f"%{strides}n{i} = load i64, ptr %{strides}q{i}\n"
+        f"%{name}t{i} = getelementptr ptr, ptr %{name}_, i64 {i}"
+    )
+
+
+def _row_of_node(name: str, strides: str, i: int, kind: Axes, real: str) -> str:
+    """Return the store of a pointer to the row of node %k."""
+    # An argument without a node axis is read again at the same address.
+    stride = f"%{strides}n{i}" if "nodes" in axis_names(kind) else "0"
+    return (
+        f"%{name}o{i} = mul i64 %k, {stride}\n%{name}x{i} = getelementptr {real}, ptr %{name}b{i}, i64 %{name}o{i}\n"
+        f"store ptr %{name}x{i}, ptr %{name}t{i}"
+    )

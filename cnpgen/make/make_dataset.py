@@ -120,15 +120,8 @@ def make_dataset(
         "make_dataset", options, GenerationOptions(), old_keywords
     )
     where = Engine(chosen.engine, chosen.address, workers)
-    part = chosen.part
-    begin = chosen.begin
-    model = chosen.model
-    _check(part, force=force)
-    loaded = as_dataset_recipe(recipe)
-    if model is not None and not certify:
-        needed = {"certify": True}
-        raise UsageError("needs {certify}", argument="model", remedies=needed)
-    loaded = certified(loaded, model=model) if certify else loaded
+    _check(chosen.part, force=force)
+    loaded = _recipe(recipe, certify=certify, model=chosen.model)
     notes = load_notes(loaded)
     workspace = find_workspace(dataset_folder(loaded, out))
     check_place(workspace)
@@ -143,9 +136,23 @@ def make_dataset(
         force=force,
     )
     # The specification in the folder may differ in informational keys, which are kept.
-    spec = open_workspace(workspace.folder, job.spec, force=force)
-    job = replace(job, spec=spec)
+    job = replace(job, spec=open_workspace(workspace.folder, job.spec, force=force))
+    part = chosen.part
+    begin = chosen.begin
     return run(job, notes, engine=where, part=part, begin=begin, progress=progress)
+
+
+def _recipe(
+    recipe: str | Path | DatasetRecipe, *, certify: bool, model: str | Path | None
+) -> DatasetRecipe:
+    """Return the loaded recipe, with plans of all samples if they are to be certified."""
+    loaded = as_dataset_recipe(recipe)
+    if certify:
+        return certified(loaded, model=model)
+    if model is not None:
+        needed = {"certify": True}
+        raise UsageError("needs {certify}", argument="model", remedies=needed)
+    return loaded
 
 
 def run(

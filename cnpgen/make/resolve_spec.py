@@ -60,35 +60,40 @@ def resolve(
     shard size, unless ``force`` deletes it.
     """
     total, root, shard_size = _check(recipe, n, seed, shard_size)
-    begun = workspace.spec
-    if begun is not None and (begun.recipe_sha256 != recipe_digest(recipe) or force):
-        # Another dataset, or one that will be deleted.
-        begun = None
+    begun = _begun(recipe, workspace, force=force)
     if begun is not None:
         # A dataset is continued as it was begun, unless the caller states otherwise.
         backend = begun.backend if backend is None else backend
         shard_size = begun.shard_size if shard_size is None else shard_size
-    chosen, cache_folder = choose_backend(backend)
+    chosen, cache = choose_backend(backend)
     prepared = PreparedPipeline(
-        recipe.pipeline, backend=chosen, cache_folder=cache_folder, dtype=dtype
+        recipe.pipeline, backend=chosen, cache_folder=cache, dtype=dtype
     )
     if prepared.tasks is not None:
         total = _solved_tasks(prepared, recipe, root, n)
     rows = shard_size or default_shard_size(total, prepared.block_rows)
     width = sum(max(field.width, 1) for field in prepared.fields)
     check_memory("shard_size", rows, min(rows, total) * width)
-    splits = split_rows(recipe, total)
     spec = _spec(
         recipe,
         prepared,
-        splits,
+        split_rows(recipe, total),
         begun,
         seed=root,
         rows=rows,
         dtype=dtype,
         backend=chosen,
     )
-    return Job(workspace.folder, spec, recipe.pipeline, chosen, cache_folder)
+    return Job(workspace.folder, spec, recipe.pipeline, chosen, cache)
+
+
+def _begun(
+    recipe: DatasetRecipe, workspace: Workspace, *, force: bool
+) -> DatasetSpec | None:
+    """Return the specification of a dataset of the recipe that is there and stays."""
+    spec = workspace.spec
+    is_continued = spec is not None and spec.recipe_sha256 == recipe_digest(recipe)
+    return spec if is_continued and not force else None
 
 
 def _spec(

@@ -24,7 +24,7 @@ from cnpgen.plans.format import (
     refuse_misspelt,
     report_unused,
 )
-from cnpgen.plans.plan_file import agreed_problem, stored_problem
+from cnpgen.plans.plan_file import agreed_problem, errors_of_file, stored_problem
 from cnpgen.plans.plans import Plans, make_plans
 from cnpgen.plans.plausible import check_boundary_units
 from cnpgen.problems.problem import Problem
@@ -364,9 +364,8 @@ def _of_file(
         command="solve",
         parameters=file.columns.get("parameters") if extrapolate else None,
     )
-    if (
-        recorded := file.text("problem_sha256")
-    ) and recorded != problem.comparable_sha256:
+    recorded = file.text("problem_sha256")
+    if recorded and recorded != problem.comparable_sha256:
         raise DatasetError(
             f"{path} is of another problem than {problem.name!r}: its problem_sha256 is not this one's"
         )
@@ -380,14 +379,10 @@ def _of_file(
         **boundary.arrays(),
         "sample_id": file.sample_id(len(boundary)),
     }
-    try:
+    with errors_of_file(path):
         plans = plans_of_rows(
             problem, columns, source=f"boundary conditions in {path.name}"
         )
-    except UsageError as error:
-        field = f"{error.argument} " if error.is_predicate else ""
-        text = f"{path}: {field}{error.args[0]}"
-        raise DatasetError(text, remedies=error.remedies) from error
     return replace(plans, has_checksum=file.has_checksum)
 
 

@@ -7,7 +7,8 @@ from __future__ import annotations
 
 import io
 import os
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -109,13 +110,20 @@ def load_plans(
         command="evaluate",
         parameters=columns.get("parameters") if extrapolate else None,
     )
-    try:
+    with errors_of_file(path):
         plans = _assembled(path, record, columns, attributes)
+    return correct_tips(replace(plans, has_checksum=has_checksum), where=f"{path}: ")
+
+
+@contextmanager
+def errors_of_file(path: Path) -> Iterator[None]:
+    """Raise UsageErrors about the content of a file as DatasetErrors that name it."""
+    try:
+        yield
     except UsageError as error:
         field = f"{error.argument} " if error.is_predicate else ""
         text = f"{path}: {field}{error.args[0]}"
         raise DatasetError(text, remedies=error.remedies) from error
-    return correct_tips(replace(plans, has_checksum=has_checksum), where=f"{path}: ")
 
 
 def _columns(path: Path, file: Hdf5) -> dict[str, NDArray[Any]]:

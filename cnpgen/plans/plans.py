@@ -253,24 +253,29 @@ def make_plans(
     rows = path.shape[0] if path.ndim else 0
     ids = np.arange(rows) if sample_id is None else sample_id
     statuses = np.zeros(rows, np.uint8) if status is None else status
-    given = (columns or {}).items()
+    given = columns or {}
     plans = Plans(
         problem=record,
         boundary=Boundary(**parts),  # type: ignore[arg-type]
         path_control_points=path,
         rate_control_points=numbers("rate_control_points", rate_control_points),
         degree=record.trajectory.degree if degree is None else degree,
-        columns={name: numbers(name, values) for name, values in given},
+        columns={name: numbers(name, values) for name, values in given.items()},
         sample_id=_integers("sample_id", ids, np.int64),
         status=_integers("status", statuses, np.uint8),
         source=source,
     )
-    robot = open_problem(record)[1]
+    _check_units(plans, allow_large_angles=allow_large_angles)
+    return _with_tips(plans)
+
+
+def _check_units(plans: Plans, *, allow_large_angles: bool) -> None:
+    """Refuse boundary conditions that are probably in degrees or millimetres."""
+    robot = open_problem(plans.problem)[1]
     boundary = plans.boundary
     check_boundary_units(
         robot, boundary, argument="boundary", allow_large_angles=allow_large_angles
     )
-    return _with_tips(plans)
 
 
 def _with_tips(plans: Plans) -> Plans:

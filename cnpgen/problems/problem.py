@@ -429,8 +429,7 @@ class Problem:
             # The reader of the robot raises errors about the text itself.
             with suppress(ValueError):
                 tree = urdf_tree(text)
-                names = spec.allow_unused
-                check_elements(tree, self.urdf_path, allow_unused=names)
+                check_elements(tree, self.urdf_path, allow_unused=spec.allow_unused)
         text = with_locked_joints(text, positions, is_stored=self.is_stored)
         text = with_point_masses(text)
         # Meshes need not exist where no constraint uses the geometry.
@@ -451,6 +450,11 @@ class Problem:
         if spec.srdf:
             srdf = self.path.parent / spec.srdf
             text = with_disabled_pairs(text, srdf, allow_unused=spec.allow_unused)
+        return self._with_payload(text)
+
+    def _with_payload(self, text: str) -> str:
+        """Return a URDF with the box of a payload that is a body, and with the ignored pairs."""
+        spec = self.robot
         text = with_payload_link(text, spec, self.payload, is_stored=self.is_stored)
         # Links that hold the payload touch it in every state.
         touching = () if self.payload is None else self.payload.touch_links

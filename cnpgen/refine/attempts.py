@@ -50,22 +50,17 @@ def _all_attempts(
     refiner: Refiner, task: RefinementTask, x: Array | None
 ) -> Iterator[Attempt]:
     if refiner.settings.max_iterations == 0:
-        guess, outcome = (
-            (refiner.line_guess(task), Outcome.SOLVED)
-            if x is None
-            else (x, Outcome.ADJUSTED)
-        )
-        yield refiner.measured(task, guess, outcome, unlimited=True)
+        first = refiner.line_guess(task) if x is None else x
+        outcome = Outcome.SOLVED if x is None else Outcome.ADJUSTED
+        yield refiner.measured(task, first, outcome, unlimited=True)
         return
     # A plan with more control points than the problem's is refined with the problem's
     # first, which is faster.
     if x is not None and refiner.coarser is not None:
         yield from _with_fewer_control_points(refiner, refiner.coarser, task, x)
-    adjusted = (
-        refiner.measured(task, x, Outcome.ADJUSTED)
-        if x is not None and task.at_rest
-        else None
-    )
+    adjusted = None
+    if x is not None and task.at_rest:
+        adjusted = refiner.measured(task, x, Outcome.ADJUSTED)
     # Compiled trees find a path in milliseconds; without them, paths are the last resort.
     searches_trees = refiner.measures_hulls and task.deadline is None
     # From a line deep inside an obstacle the coarse level cannot find a way around it.
@@ -80,23 +75,17 @@ def _all_attempts(
         return
     if searches_trees:
         best = yield from _best_of(along_tree_paths(refiner, task, best), best)
-    others = _from_other_guesses(
-        refiner, task, x if adjusted is None else adjusted.variables, best
-    )
+    start = x if adjusted is None else adjusted.variables
+    others = _from_other_guesses(refiner, task, start, best)
     best = yield from _best_of(others, best)
-    even_line = refiner.even_line_guess(task)
-    # all attempts so far may depend on the input plan or on the rising rate
-    if x is not None or not np.array_equal(even_line, refiner.line_guess(task)):
-        best = yield from _restart(refiner, task, None, even_line, best)
-    best = yield from _restart(refiner, task, best.variables, even_line, best)
+    best = yield from _from_even_line(refiner, task, x, best)
     if searches_trees or task.deadline is not None:
         return
     if has_clearance_constraints(refiner.problem, refiner.robot):
         yield from around_obstacles(refiner, task, best)
     elif task.at_rest:
-        yield from (
-            along_path(refiner, task, guess) for guess in path_guesses(refiner, task)
-        )
+        for guess in path_guesses(refiner, task):
+            yield along_path(refiner, task, guess)
 
 
 def _best_of(
@@ -185,6 +174,13 @@ def run_levels(
     # The fine levels would start far from any valid motion.
     if best.violation > max_violation:
         return best
+    return (yield from _finer_levels(refiner, task, adjusted, best))
+
+
+def _finer_levels(
+    refiner: Refiner, task: RefinementTask, adjusted: Attempt | None, best: Attempt
+) -> Generator[Attempt, None, Attempt]:
+    """Yield the attempts of the fine and strict levels from ``best``; return the best one."""
     fine = refiner.solve(task, refiner.levels.fine, best.variables, Outcome.SOLVED_FINE)
     yield fine
     if (
@@ -247,6 +243,17 @@ def _restart(
             (replace(attempt, outcome=Outcome.RESTARTED) for attempt in attempts), best
         )
     )
+
+
+def _from_even_line(
+    refiner: Refiner, task: RefinementTask, x: Array | None, best: Attempt
+) -> Generator[Attempt, None, Attempt]:
+    """Yield attempts from the line with an even rate, and from ``best``; return the best one."""
+    even_line = refiner.even_line_guess(task)
+    # all attempts so far may depend on the input plan or on the rising rate
+    if x is not None or not np.array_equal(even_line, refiner.line_guess(task)):
+        best = yield from _restart(refiner, task, None, even_line, best)
+    return (yield from _restart(refiner, task, best.variables, even_line, best))
 
 
 # Obstacles

@@ -145,12 +145,11 @@ def refine_tasks(
     several = to_any_goal and GOAL_OPTION in plans.columns
     groups = goal_groups(plans) if several else [[row] for row in range(len(plans))]
     identity = identity_of_run(plans, options, tasks=len(groups))
-    file = (
-        None
-        if journal is None
-        else open_journal(Path(journal), identity, discard=discard)
-    )
-    finished: dict[int, Attempt] = {} if file is None else dict(file.finished)
+    file = None
+    finished = dict[int, Attempt]()
+    if journal is not None:
+        file = open_journal(Path(journal), identity, discard=discard)
+        finished |= file.finished
     waiting = [rows for rows in groups if finished.keys().isdisjoint(rows)]
     if begin is not None:
         begin(len(groups), len(groups) - len(waiting))
@@ -164,11 +163,8 @@ def refine_tasks(
             file.close()
     # One row of every group has a result.
     chosen = [row for rows in groups for row in rows if row in finished]
-    refinement = _refinement(
-        plans if len(groups) == len(plans) else plans[chosen],
-        [finished[row] for row in chosen],
-        options,
-    )
+    kept = plans if len(groups) == len(plans) else plans[chosen]
+    refinement = _refinement(kept, [finished[row] for row in chosen], options)
     return replace(refinement, times=watch.times())
 
 

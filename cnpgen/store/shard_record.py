@@ -164,14 +164,14 @@ def commit_shard(
     scenes, too; others raise DatasetError. Other arguments become attributes of the
     record.
     """
+    # Another process may have made the same shard.
     if is_committed(folder, spec, task):
-        # Another process made the same shard.
         return load_record(folder, task)
     try:
         record = ShardRecord(
             file=task.file,
             bytes=_write(folder, spec, task, columns, scenes),
-            # The sha256 is that of the file as the disk returns it, not of the buffer.
+            # As the disk returns the file, not as the buffer has it.
             sha256=file_sha256(folder / task.file),
             rows=task.rows,
             first_sample_id=task.first_row,
@@ -182,8 +182,8 @@ def commit_shard(
             seconds=seconds,
             versions=versions or {},
         )
+        # Another process may already have summarized its record.
         if not is_committed(folder, spec, task):
-            # Otherwise another process may already have summarized its record.
             save_record(folder, task, record)
             return record
     except CnpgenError:

@@ -116,11 +116,8 @@ def train_model(
     out = Path(out)
     settings = settings or TrainingSettings()
     lengths = {"steps": steps, "epochs": chosen.epochs, "cpu_seconds": cpu_seconds}
-    passed: dict[str, Any] = {
-        name: value for name, value in lengths.items() if value is not None
-    }
-    passed = passed or {"cpu_seconds": DEFAULT_CPU_TIME_S}
-    length = Length(**passed)
+    stated = {name: value for name, value in lengths.items() if value is not None}
+    passed: dict[str, Any] = stated or {"cpu_seconds": DEFAULT_CPU_TIME_S}
     check_rows = integer("check_rows", check_rows, least=1)
     check_out(out)
     remove_temporary_files(out)
@@ -129,14 +126,13 @@ def train_model(
     own = {"length": plain(passed), "check_rows": check_rows, "start_from": digest}
     run_identity = identity(source, settings) | own
     checkpoints = Checkpoints(out.with_suffix(CHECKPOINT), run_identity)
+    # A checkpoint is removed after its model is saved: without one the run is finished.
+    if not force and out.exists() and not checkpoints.path.exists():
+        return _finished(out, checkpoints.identity)
     if not force:
-        # A checkpoint is removed after its model is saved: without one the run is
-        # finished.
-        if out.exists() and not checkpoints.path.exists():
-            return _finished(out, checkpoints.identity)
         check_beside(out)
     request = _TrainingRequest(
-        out, source, settings, length, model, check_rows, checkpoints
+        out, source, settings, Length(**passed), model, check_rows, checkpoints
     )
     return _train(request, chosen, clock, force=force, workers=workers)
 

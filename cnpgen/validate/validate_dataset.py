@@ -271,30 +271,22 @@ def validate_dataset(
             backend of the dataset does not work on this machine.
     """
     regenerate = integer("regenerate", regenerate, least=0)
-    machine_engine = Engine(engine, address, workers)
+    where = Engine(engine, address, workers)
     folder = require_dataset(folder)
     findings = check_dataset(folder)
     try:
         spec = load_dataset_spec(folder)
     except DatasetError:
         return ValidationReport(folder, 0, tuple(findings))
-    # Missing packages and backends, and a recipe that cannot be restored, are reported
-    # before the expensive checks.
-    if regenerate:
-        backend_of(folder, spec)
-    if deep or regenerate:
-        with restored(spec):
-            pass
+    _check_recomputable(folder, spec, deep=deep, regenerate=regenerate > 0)
     existing = [task for task in shards(spec) if is_committed(folder, spec, task)]
-    damaged = {finding.file for finding in findings if not finding.note}
-    # A damaged shard is a finding already; HDF5 may hang on it.
-    undamaged = [task for task in existing if task.file not in damaged]
+    undamaged = _undamaged(existing, findings)
     findings += check_recipe(spec)
     checked = DeepCheck()
     again = Regeneration()
     if deep:
         findings += check_statistics(folder, spec)
-        checked = check_rows(folder, spec, undamaged, machine_engine, progress)
+        checked = check_rows(folder, spec, undamaged, where, progress)
     if regenerate:
         again = regenerate_blocks(folder, spec, undamaged, regenerate)
     return ValidationReport(
@@ -308,6 +300,23 @@ def validate_dataset(
         regenerated=again.made,
         identical=again.identical,
     )
+
+
+def _check_recomputable(
+    folder: Path, spec: DatasetSpec, *, deep: bool, regenerate: bool
+) -> None:
+    """Report missing packages and backends, and a recipe that cannot be restored, before the expensive checks."""
+    if regenerate:
+        backend_of(folder, spec)
+    if deep or regenerate:
+        with restored(spec):
+            pass
+
+
+def _undamaged(existing: list[ShardTask], findings: list[Finding]) -> list[ShardTask]:
+    """Return the shards without findings. A damaged one is a finding already; HDF5 may hang on it."""
+    damaged = {finding.file for finding in findings if not finding.note}
+    return [task for task in existing if task.file not in damaged]
 
 
 def check_recipe(spec: DatasetSpec) -> list[Finding]:

@@ -29,19 +29,11 @@ if TYPE_CHECKING:
 
 def add_options(parser: Parser) -> None:
     option = parser.add_argument
-    option(
-        "name",
-        metavar="NAME",
-        type=_folder,
-        help="name of the recipes and of their folder",
-    )
+    text = "name of the recipes and of their folder"
+    option("name", metavar="NAME", type=_folder, help=text)
     kind = parser.add_mutually_exclusive_group(required=True)
-    kind.add_argument(
-        "--urdf",
-        metavar="FILE",
-        type=Path,
-        help="URDF file; the recipes refer to its path",
-    )
+    text = "URDF file; the recipes refer to its path"
+    kind.add_argument("--urdf", metavar="FILE", type=Path, help=text)
     kind.add_argument(
         "--planner",
         action="store_true",
@@ -82,10 +74,8 @@ def run(arguments: argparse.Namespace) -> None:
         return
     check_absent(folder, FILES, force=arguments.force)
     arm, limits = _arm_and_limits(arguments)
-    packages = (
-        *arguments.packages,
-        *packages_of_environment(arm.meshes, arm.urdf, arguments.packages),
-    )
+    found = packages_of_environment(arm.meshes, arm.urdf, arguments.packages)
+    packages = (*arguments.packages, *found)
     with warnings.catch_warnings():
         # About the robot, which are in the notes.
         warnings.simplefilter("ignore", RuntimeWarning)

@@ -117,20 +117,21 @@ class ChunkExecutor:
             noise=options.noise,
         )
         self._motions = ChunkMotions(self._record, self._rate, max_speed)
-        # Numbers of samples that delays leave, one of each parametrization of motions.
+        self._lengths = self._motions.prepare(self._lengths_left(max_speed))
+        self._lock = threading.RLock()
+        self._runtime: PlanRuntime | None = None
+        self._latched: SwitchOutcome | None = SwitchOutcome.STOPPED
+        self._clock = CallersClock(self._stale_after)
+        self._observed = -np.inf  # time of the last observation
+
+    def _lengths_left(self, max_speed: float) -> list[int]:
+        """Return the numbers of samples that delays leave, one of each parametrization of motions."""
         # Samples that pass between the observation and the join, at the largest speed.
         delay = (self._stale_after + self._join) * max_speed
         skipped = min(int(delay * self._rate) + 1, self._length - MIN_CHUNK_SAMPLES)
         left = range(self._length - skipped, self._length + 1)
         # Samples beyond the horizon are not followed.
-        used = [min(samples, self._horizon) for samples in left]
-        self._lengths = self._motions.prepare(used)
-        self._lock = threading.RLock()
-        self._runtime: PlanRuntime | None = None
-        self._latched: SwitchOutcome | None = SwitchOutcome.STOPPED
-        self._clock = CallersClock(self._stale_after)
-        # Time of the last observation.
-        self._observed = -np.inf
+        return [min(samples, self._horizon) for samples in left]
 
     @property
     def stopped(self) -> SwitchOutcome | None:

@@ -140,15 +140,8 @@ def chunk_fit(length: int, rate: float) -> ChunkFit:
     fine = np.linspace(0, 1, 4001)
     # The inverse of x(s) on a fine table gives the phases of the samples.
     phases = np.interp(np.arange(length) * step, chunk_times(fine, duration), fine)
-    # Jerks are p''' / D^3, and their mean square over 4 C phases is the penalty.
-    inner = np.linspace(0, 1, 4 * points)
-    weight = SMOOTHNESS / duration**3 * np.sqrt(length / len(inner))
-    rows = np.concatenate(
-        [
-            basis(phases, points, CHUNK_DEGREE),
-            weight * basis(inner, points, CHUNK_DEGREE, 3),
-        ]
-    )
+    penalty = _jerk_penalty(points, length, duration)
+    rows = np.concatenate([basis(phases, points, CHUNK_DEGREE), penalty])
     ends = np.r_[:FIXED_POINTS, points - FIXED_POINTS : points]
     samples = min(END_SAMPLES, length)
     x = np.arange(samples) * step
@@ -172,6 +165,15 @@ def chunk_fit(length: int, rate: float) -> ChunkFit:
         _decay(length, step),
         ramp,
     )
+
+
+def _jerk_penalty(points: int, length: int, duration: float) -> Array:
+    """Return the rows whose squares are the penalty of the jerks."""
+    # Jerks are p''' / D^3, and their mean square over 4 C phases is the penalty.
+    inner = np.linspace(0, 1, 4 * points)
+    weight = SMOOTHNESS / duration**3 * np.sqrt(length / len(inner))
+    rows: Array = weight * basis(inner, points, CHUNK_DEGREE, 3)
+    return rows
 
 
 def chunk_times(s: Array, duration: float) -> Array:

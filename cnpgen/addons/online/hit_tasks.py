@@ -115,29 +115,28 @@ def hit_tasks(
     )
     _check_distance(completion, contact_distance, {"puck": centre, "target": goal})
     # The goal of the mallet is behind the puck, seen from the target.
-    columns = dict(
-        zip(
-            HIT_COLUMNS,
-            [*parts, behind(centre, angles, contact_distance), angles, shares],
-            strict=True,
-        )
-    )
+    mallet = behind(centre, angles, contact_distance)
+    columns = dict(zip(HIT_COLUMNS, [*parts, mallet, angles, shares], strict=True))
     columns |= _parameter_columns(completion.context, parameters)
-    counts = {name: values.shape[1] for name, values in columns.items()}
-    largest = max(counts.values())
-    for column, count in counts.items():
-        name = _ARGUMENT_OF.get(column, column)
+    _check_counts(columns, completion.width)
+    return completion(columns)
+
+
+def _check_counts(columns: Mapping[str, Array], width: int) -> None:
+    """Check that the columns have one number of hits, or 1, and that their tasks fit into the memory."""
+    counts = [
+        (_ARGUMENT_OF.get(column, column), values.shape[1])
+        for column, values in columns.items()
+    ]
+    largest = max(count for _, count in counts)
+    for name, count in counts:
         if count == 0:
             raise UsageError("is empty, expected at least 1 hit", argument=name)
         if count not in {1, largest}:
             raise UsageError(
                 f"has {count:,} hits, another argument has {largest:,}", argument=name
             )
-    check_memory_of_rows(
-        {_ARGUMENT_OF.get(name, name): count for name, count in counts.items()},
-        completion.width,
-    )
-    return completion(columns)
+    check_memory_of_rows(dict(counts), width)
 
 
 def _parameter_columns(

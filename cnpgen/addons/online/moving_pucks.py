@@ -9,6 +9,7 @@ puck is a homogeneous disc: rolling transfers a third of it.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cache
 
@@ -25,6 +26,7 @@ from cnpgen.addons.online.hit_tasks import (
 from cnpgen.arrays import Array
 from cnpgen.errors import UsageError
 from cnpgen.pipelines.completion import Completion
+from cnpgen.pipelines.stages.stage import TaskBatch
 from cnpgen.planner.planner import Planner, plan_tasks
 from cnpgen.plans.boundary_problems import CONTEXT
 from cnpgen.plans.plans import Plans
@@ -107,25 +109,20 @@ class PuckModel:
         """
         # The path over the velocity that a puck still covers [s].
         # With dv/dt = -k v, a puck covers v (1 - exp(-k t)) / k within t.
-        left = (
-            np.array(time, np.float64)
-            if self.drag == 0
-            else -np.expm1(-self.drag * time) / self.drag
-        )
+        left = np.array(time, np.float64)
+        if self.drag:
+            left = -np.expm1(-self.drag * time) / self.drag
         position = position.copy()
         velocity = velocity.copy()
         low = np.array([self.home_edge, -self.half_width])
         high = np.array([np.inf, self.half_width])
         for _ in range(MAX_BOUNCES):
+            # The side band or the home band that each coordinate moves to, if there is
+            # one.
+            bound = np.where(velocity > 0, high, low)
             with np.errstate(divide="ignore", invalid="ignore"):
-                # The side band or the home band that each coordinate moves to, if there
-                # is one.
-                bound = np.where(velocity > 0, high, low)
-                share = np.where(
-                    velocity == 0,
-                    np.inf,
-                    np.maximum((bound - position) / velocity, 0.0),
-                )
+                share = np.maximum((bound - position) / velocity, 0.0)
+            share[velocity == 0] = np.inf
             # The first of both bands that the puck reaches.
             axis = np.argmin(share, axis=1)
             rows = np.arange(len(share))
@@ -219,18 +216,12 @@ class MovingHits:
         self.waits = meeting_time is not None
         given = {"puck": puck, "puck_velocity": velocity, "target": target}
         parts = {name: lanes(name, values, {2}).T for name, values in given.items()}
-        scalars = {
-            "speed_share": share,
-            "meeting_time": 0.0 if meeting_time is None else meeting_time,
-        }
-        parts |= {
-            name: lanes(name, np.reshape(numbers(name, values), (-1, 1)), {1}).T
-            for name, values in scalars.items()
-        }
-        parts |= {
-            f"state {index}": values.T
-            for index, values in enumerate(state_lanes(state, n))
-        }
+        time = 0.0 if meeting_time is None else meeting_time
+        for name, values in {"speed_share": share, "meeting_time": time}.items():
+            column = np.reshape(numbers(name, values), (-1, 1))
+            parts[name] = lanes(name, column, {1}).T
+        for index, values in enumerate(state_lanes(state, n)):
+            parts[f"state {index}"] = values.T
         check_range("meeting_time", parts["meeting_time"], 0.0, MAX_MEETING_TIME_S, "s")
         check_range(
             "puck_velocity",
@@ -239,16 +230,7 @@ class MovingHits:
             MAX_PUCK_SPEED_M_S,
             "m/s",
         )
-        # One value of an argument holds for all hits.
-        size = max(len(values) for values in parts.values())
-        for name, values in parts.items():
-            if len(values) not in {1, size}:
-                argument = name.partition(" ")[0]
-                raise UsageError(
-                    f"has {len(values)} hits, another argument has {size}",
-                    argument=argument,
-                )
-            parts[name] = np.repeat(values, size // len(values), axis=0)
+        parts = _of_one_length(parts)
         self.puck, self.velocity, self.target = (parts[name] for name in given)
         self.share = parts["speed_share"][:, 0]
         self.meeting_time = parts["meeting_time"][:, 0]
@@ -258,6 +240,35 @@ class MovingHits:
                 "is not at rest: an arm that waits for the puck must be",
                 argument="state",
             )
+
+    def tasks_at(
+        self,
+        time: Array,
+        speed: Array,
+        rows: NDArray[np.intp],
+        completion: Completion,
+    ) -> TaskBatch:
+        """Complete the tasks of some hits that meet the pucks at these times [s] with these speeds [m/s]."""
+        position, velocity = self.model.predict(
+            self.puck[rows], self.velocity[rows], time
+        )
+        angle = self.model.hit_angle(velocity, speed, self.target[rows] - position)
+        return hit_tasks(
+            completion,
+            tuple(part[rows] for part in self.state),  # type: ignore[arg-type]
+            position,
+            self.target[rows],
+            contact_distance=self.distance,
+            share=self.share[rows],
+            angle=angle,
+        )
+
+    def touching_at_start(self, completion: Completion) -> NDArray[np.bool_]:
+        """Return which pucks touch the mallet in the state of the arm, shape (N,)."""
+        start = completion.tip_positions(self.state[0].T)[:2].T
+        distance = np.linalg.norm(self.puck - start, axis=1)
+        touching: NDArray[np.bool_] = distance < self.distance + self.overlap
+        return touching
 
     def with_pucks(self, plans: Plans, delay: Array) -> Plans:
         """Add the pucks at the starts of the plans: columns ``puck_xy`` [m] and ``puck_velocity`` [m/s]."""
@@ -269,6 +280,21 @@ class MovingHits:
             plans,
             columns={**plans.columns, "puck_xy": position, "puck_velocity": velocity},
         )
+
+
+def _of_one_length(parts: Mapping[str, Array]) -> dict[str, Array]:
+    """Return arguments by name, in which one value of an argument is repeated for all hits."""
+    size = max(len(values) for values in parts.values())
+    for name, values in parts.items():
+        if len(values) not in {1, size}:
+            raise UsageError(
+                f"has {len(values)} hits, another argument has {size}",
+                argument=name.partition(" ")[0],
+            )
+    return {
+        name: np.repeat(values, size // len(values), axis=0)
+        for name, values in parts.items()
+    }
 
 
 def plan_moving_hits(
@@ -285,34 +311,16 @@ def plan_moving_hits(
     reasons = np.full(len(hits.puck), "", object)
     active = np.arange(len(hits.puck))
     for iteration in range(MAX_MEETING_ITERATIONS):
-        position, puck_velocity = hits.model.predict(
-            hits.puck[active], hits.velocity[active], time[active]
-        )
-        angle = hits.model.hit_angle(
-            puck_velocity, speed[active], hits.target[active] - position
-        )
-        tasks = hit_tasks(
-            completion,
-            tuple(part[active] for part in hits.state),  # type: ignore[arg-type]
-            position,
-            hits.target[active],
-            contact_distance=hits.distance,
-            share=hits.share[active],
-            angle=angle,
-        )
+        tasks = hits.tasks_at(time[active], speed[active], active, completion)
         reasons[active] = tasks.why()
         active = active[tasks.alive]
         speed[active] = tasks["hit_speed"][0]
         if hits.waits and iteration == 0 and len(active):
             # The direction depends on the speed.
             continue
+        boundary = boundary_of_tasks(tasks, planner.model.fixed_at_goal)
         columns = {name: tasks[name][0] for name in CONTEXT}
-        plans = plan_tasks(
-            planner,
-            boundary_of_tasks(tasks, planner.model.fixed_at_goal),
-            active,
-            columns,
-        )
+        plans = plan_tasks(planner, boundary, active, columns)
         # The mallet covers the overlap after the contact, at about its final speed.
         contact = plans.duration - hits.overlap / speed[active]
         # Fixed point: the contact time of the plan is the next meeting time.
@@ -334,8 +342,7 @@ def plan_moving_hits(
     reasons[active[~accepted]] = reason
     touched = _touched_early(completion, hits, plans, delay)
     reasons[active[accepted & touched]] = PuckContact.reason
-    start = completion.tip_positions(hits.state[0].T)[:2].T
-    touching = np.linalg.norm(hits.puck - start, axis=1) < hits.distance + hits.overlap
+    touching = hits.touching_at_start(completion)
     reasons[touching] = PuckContact.boundary_reason
     accepted &= ~touched & ~touching[active]
     return (
@@ -370,33 +377,34 @@ def _touched_early(
         times
         <= times[:, -1:] - (hits.overlap + EARLY_CONTACT_MARGIN_M) / speed[:, None]
     )
-    parts = [(moving, times, before)]
+    touching = _touching(hits, rows, moving, times)
+    touched = np.zeros(len(plans), bool)
+    touched |= (touching & before[:, 1:]).any(axis=1)
     if start.any():
         # While it waits, the mallet rests at its start.
-        parts.append(
-            (
-                np.repeat(moving[:, :1], len(phases), axis=1),
-                start * phases,
-                np.ones_like(before),
-            )
-        )
-    touched = np.zeros(len(plans), bool)
-    for mallet, time, is_early in parts:
-        puck, velocity = (
-            np.repeat(values[rows], len(phases), axis=0)
-            for values in (hits.puck, hits.velocity)
-        )
-        # In the frame of the mallet, the puck passes the origin along segments.
-        relative = (
-            hits.model.predict(puck, velocity, time.ravel())[0].reshape(mallet.shape)
-            - mallet
-        )
-        distance = distances_from_segments(
-            np.zeros(2), relative[:, :-1], relative[:, 1:]
-        )
-        touching = distance < hits.distance + hits.overlap - MAX_EARLY_DEPTH_M
-        touched |= (touching & is_early[:, 1:]).any(axis=1)
+        resting = np.repeat(moving[:, :1], len(phases), axis=1)
+        touched |= _touching(hits, rows, resting, start * phases).any(axis=1)
     return touched
+
+
+def _touching(
+    hits: MovingHits, rows: NDArray[np.intp], mallet: Array, time: Array
+) -> NDArray[np.bool_]:
+    """Return whether pucks touch mallets at positions, shape (P, K, 2), between times, shape (P, K)."""
+    puck, velocity = (
+        np.repeat(values[rows], time.shape[1], axis=0)
+        for values in (hits.puck, hits.velocity)
+    )
+    # In the frame of the mallet, the puck passes the origin along segments.
+    relative = (
+        hits.model.predict(puck, velocity, time.ravel())[0].reshape(mallet.shape)
+        - mallet
+    )
+    distance = distances_from_segments(np.zeros(2), relative[:, :-1], relative[:, 1:])
+    touching: NDArray[np.bool_] = (
+        distance < hits.distance + hits.overlap - MAX_EARLY_DEPTH_M
+    )
+    return touching
 
 
 @cache

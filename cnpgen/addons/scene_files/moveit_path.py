@@ -49,25 +49,21 @@ def read_path_constraints(
             )
         frame, pose = table.resolve(frame, (np.zeros(3), rotation))
         a, b, c = limits.tolist()
-        yield (
-            frame,
-            LinkOrientation(
-                link=link,
-                rpy=roll_pitch_yaw(pose[1]),
-                limits=(a, b, c),
-                parametrization=kind,
-            ),
+        constraint = LinkOrientation(
+            link=link,
+            rpy=roll_pitch_yaw(pose[1]),
+            limits=(a, b, c),
+            parametrization=kind,
         )
+        yield frame, constraint
     for entry in part(constraints, "position_constraints", list, where):
         frame, link = _frame_and_link(entry, where)
         check_weight(entry, where)
         frame, pose = table.resolve(frame, (np.zeros(3), np.eye(3)))
         regions = _regions(part(entry, "constraint_region", dict, where), where)
         placed = tuple(moved_obstacle(each, pose) for each in regions)
-        yield (
-            frame,
-            LinkPosition(link=link, offset=_offset(entry, where), region=placed),
-        )
+        offset = _offset(entry, where)
+        yield frame, LinkPosition(link=link, offset=offset, region=placed)
 
 
 def _frame_and_link(entry: Any, where: str) -> tuple[str, str]:

@@ -67,13 +67,7 @@ def read_octomap(
         raise SceneError(
             f"{where}: resolution must be {MIN_RESOLUTION_M:g} to {MAX_RESOLUTION_M:g} m, got {resolution:g}"
         )
-    values = vector(part(tree, "data", list, where), "", f"{where}: data")
-    if not (
-        np.isfinite(values) & (np.abs(values) < 256) & (values == values.round())
-    ).all():
-        raise SceneError(f"{where}: data must be bytes")
-    # Messages have signed bytes, octrees unsigned ones.
-    data = (values.astype(int) % 256).astype(np.uint8).tobytes()
+    data = _data(tree, where)
     is_binary = is_true(tree.get("binary"), f"{where}: binary")
     cells = decoded_cells(data, is_binary=is_binary, where=where)
     frame, pose = table.resolve(
@@ -88,6 +82,17 @@ def read_octomap(
         )
     for box in _boxes(cells, resolution, free, where):
         yield frame, moved_obstacle(box, pose)
+
+
+def _data(tree: Any, where: str) -> bytes:
+    """Return the bytes of an octree."""
+    values = vector(part(tree, "data", list, where), "", f"{where}: data")
+    if not (
+        np.isfinite(values) & (np.abs(values) < 256) & (values == values.round())
+    ).all():
+        raise SceneError(f"{where}: data must be bytes")
+    # Messages have signed bytes, octrees unsigned ones.
+    return (values.astype(int) % 256).astype(np.uint8).tobytes()
 
 
 def decoded_cells(data: bytes, *, is_binary: bool, where: str) -> list[Cell]:

@@ -85,15 +85,7 @@ def load_scenes(
     path = Path(path)
     start = integer("start", start, least=0)
     stop = None if n is None else start + integer("n", n, least=1)
-    is_list = not isinstance(packages, str | Path)
-    if not is_list or not all(isinstance(each, str | Path) for each in packages):
-        raise UsageError(
-            f"must be paths of folders, got {packages!r}", argument="packages"
-        )
-    if missing := [each for each in packages if not Path(each).is_dir()]:
-        raise UsageError(
-            f"must be folders, there is no {missing[0]}", argument="packages"
-        )
+    _check_packages(packages)
     options = ReadingOptions(
         (*allow_unused, *allowed_elsewhere), tuple(map(Path, packages)), present or {}
     )
@@ -118,6 +110,19 @@ def load_scenes(
     check_allowed(allow_unused, unused, set().union(*(each.keys for each in accounts)))
     _report(path, accounts)
     return [checked_scene(scene) for scene in scenes]
+
+
+def _check_packages(packages: Sequence[str | Path]) -> None:
+    """Check that packages are paths of folders."""
+    is_list = not isinstance(packages, str | Path)
+    if not is_list or not all(isinstance(each, str | Path) for each in packages):
+        raise UsageError(
+            f"must be paths of folders, got {packages!r}", argument="packages"
+        )
+    if missing := [each for each in packages if not Path(each).is_dir()]:
+        raise UsageError(
+            f"must be folders, there is no {missing[0]}", argument="packages"
+        )
 
 
 def _warn_of_unneeded_start(

@@ -214,19 +214,10 @@ def _limit_findings(
 ) -> Iterator[EpisodeFinding]:
     """Yield the limits that no curve through the states meets."""
     q = episode.state[:, scale.columns] * scale.factor
-    noise, jitter = errors
-    error, known, text = _noise(q, arm, noise)
-    period = float(np.median(np.diff(episode.t)))
-    # Without a clock, half a period is assumed as error of the times.
-    is_assumed = jitter is None and episode.is_nominal
-    if jitter is None:
-        jitter = NOMINAL_JITTER * period if is_assumed else time_rounding(episode.t)[1]
-    # Half of a stall on either side of two frames.
-    largest = max(jitter, MAX_STALL_S / 2) if is_assumed else jitter
-    basis = f"{text}; jitter {jitter:.2g} s"
-    samples = _Samples(
-        episode.t, q, error, NOMINAL_LAGS if episode.is_nominal else None
-    )
+    error, known, text = _noise(q, arm, errors[0])
+    jitter, largest = _jitters(episode, errors[1])
+    lags = NOMINAL_LAGS if episode.is_nominal else None
+    samples = _Samples(episode.t, q, error, lags)
     for quantity, unit in QUANTITIES.items():
         limit = arm.limits.get(quantity)
         if limit is None:
@@ -235,32 +226,24 @@ def _limit_findings(
         if quantity == "position" and not scale.has_zero:
             not_run[quantity] = "the zero of the joints is not known"
             continue
-        worst = _worst(limit, samples.compared(quantity, limit, jitter))
         # Only limits of the vendor exclude, with a known noise, and not of
         # accelerations.
         proven = known and limit.basis == VENDOR and quantity != "acceleration"
-        if worst is None and quantity == "velocity":
-            # Over many frames, a recorder that falls behind explains the excess, too.
-            far = replace(samples, lags=None)
-            proven = False
-            worst = _worst(limit, far.compared(quantity, limit, jitter))
+        worst, proven = _excess(
+            samples, limit, quantity, (jitter, largest), proven=proven
+        )
         if worst is None:
             continue
-        # A velocity that a stall of the recorder explains is for review.
-        if proven and quantity == "velocity" and largest > jitter:
-            of_stall = _worst(limit, samples.compared(quantity, limit, largest))
-            proven = of_stall is not None
-            worst = of_stall or worst
         joint, time, value, bound = worst
         word = "at least" if value >= bound else "at most"
+        where = " at these positions" if limit.by_position is not None else ""
         yield EpisodeFinding(
             Level.EXCLUDE if proven else Level.REVIEW,
             quantity,
             arm.joints[joint],
             time,
-            f"{word} {value:.3g} {unit} at {time:.2f} s, limit {bound:.3g}"
-            + (" at these positions" if limit.by_position is not None else ""),
-            f"limit: {limit.basis}, {limit.source}; {basis}",
+            f"{word} {value:.3g} {unit} at {time:.2f} s, limit {bound:.3g}{where}",
+            f"limit: {limit.basis}, {limit.source}; {text}; jitter {jitter:.2g} s",
         )
 
 
@@ -309,6 +292,43 @@ def _noise(q: Array, arm: RecordedArm, noise: float | None) -> tuple[float, bool
         error = max(arm.noise, half)
         return error, True, f"noise {error:.2g} rad: {arm.noise_source}"
     return half, False, f"noise {half:.2g} rad by rounding alone"
+
+
+def _jitters(episode: Episode, stated: float | None) -> tuple[float, float]:
+    """Return the error of the times [s], and that with stalls of the recorder."""
+    if stated is not None:
+        return stated, stated
+    if not episode.is_nominal:
+        jitter = time_rounding(episode.t)[1]
+        return jitter, jitter
+    # Without a clock, half a period is assumed as error of the times.
+    jitter = NOMINAL_JITTER * float(np.median(np.diff(episode.t)))
+    # Half of a stall on either side of two frames.
+    return jitter, max(jitter, MAX_STALL_S / 2)
+
+
+def _excess(
+    samples: _Samples,
+    limit: ArmLimit,
+    quantity: str,
+    jitters: tuple[float, float],
+    *,
+    proven: bool,
+) -> tuple[tuple[int, float, float, float] | None, bool]:
+    """Return the largest excess, as ``_worst``, and whether it stays proven; ``jitters`` are without and with stalls [s]."""
+    jitter, largest = jitters
+    worst = _worst(limit, samples.compared(quantity, limit, jitter))
+    if quantity != "velocity":
+        return worst, proven
+    if worst is None:
+        # Over many frames, a recorder that falls behind explains the excess, too.
+        far = replace(samples, lags=None)
+        return _worst(limit, far.compared(quantity, limit, jitter)), False
+    # A velocity that a stall of the recorder explains is for review.
+    if proven and largest > jitter:
+        of_stall = _worst(limit, samples.compared(quantity, limit, largest))
+        return of_stall or worst, of_stall is not None
+    return worst, proven
 
 
 def _worst(

@@ -129,11 +129,7 @@ def _read_lerobot(folder: Path) -> Recording:
     episodes = []
     for file in sorted(folder.glob("data/*/*.parquet")):
         table = read_parquet(file)
-        for name in ("timestamp", "episode_index", "frame_index", STATE):
-            if name not in table.column_names:
-                raise UsageError(
-                    f"{file}: there is no column {name!r}", concerns="path"
-                )
+        _check_columns(table, file)
         number = _column(table, "episode_index", file, 1)[:, 0]
         t = _column(table, "timestamp", file, 1)[:, 0]
         frame = _column(table, "frame_index", file, 1)[:, 0].astype(np.int64)
@@ -145,14 +141,18 @@ def _read_lerobot(folder: Path) -> Recording:
             rows = number == index
             part = None if action is None else action[rows]
             length = lengths.get(int(index))
-            episodes.append(
-                Episode(
-                    f"{index:g}", t[rows], state[rows], part, names, frame[rows], length
-                )
-            )
+            columns = t[rows], state[rows], part, names, frame[rows], length
+            episodes.append(Episode(f"{index:g}", *columns))
     if not episodes:
         raise UsageError(f"{folder} holds no episodes", concerns="path")
     return Recording(tuple(episodes), robot, "lerobot")
+
+
+def _check_columns(table: Any, file: Path) -> None:
+    """Check that a file has the columns of episodes."""
+    for name in ("timestamp", "episode_index", "frame_index", STATE):
+        if name not in table.column_names:
+            raise UsageError(f"{file}: there is no column {name!r}", concerns="path")
 
 
 def _stated_lengths(folder: Path) -> dict[int, int]:

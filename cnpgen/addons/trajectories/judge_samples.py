@@ -117,14 +117,11 @@ def judge_samples(
             verdict = judge(curve, trajectory, scene=scene, step=step)
             if verdict.valid:
                 return verdict
-            excess = (
-                str(verdict.conditions[verdict.decisive].margin)
-                if verdict.conditions
-                else ""
-            )
-        detail = (
-            f"a smooth curve within the errors is not valid: {excess}" if excess else ""
-        )
+            excess = ""
+            if verdict.conditions:
+                excess = str(verdict.conditions[verdict.decisive].margin)
+        text = f"a smooth curve within the errors is not valid: {excess}"
+        detail = text if excess else ""
     noise = np.zeros(3) if exact else moved.values
     if not np.isfinite(noise).all():
         return TrajectoryVerdict(

@@ -46,6 +46,52 @@ _POSE_NAME = re.compile(rf"{OBSTACLE_POSES}(_[0-9]+)?")  # a value of LeRobot
 
 def read_lerobot(folder: Path) -> Iterator[TrajectoryTable]:
     """Yield the episodes of a LeRobotDataset v3: states, or actions without them, with their names."""
+    info, key, names, described = _described_dataset(folder)
+    parameters = {
+        name: k for k, name in enumerate(described) if name in PARAMETER_UNITS
+    }
+    scene = [k for k, name in enumerate(described) if _POSE_NAME.fullmatch(name)]
+    widths = {"timestamp": 1, "episode_index": 1, key: len(names)}
+    if parameters or scene:
+        widths[LEROBOT_ENVIRONMENT] = len(described)
+    read = {key, *_INDICES, *([LEROBOT_ENVIRONMENT] if described else [])}
+    unused = [name for name in info["features"] if name not in read]
+    unused += [
+        f"{LEROBOT_ENVIRONMENT} {name}"
+        for k, name in enumerate(described)
+        if name not in parameters and k not in scene
+    ]
+    unused += _unknown_keys(info, _INFO_KEYS, "info.json", folder)
+    for name in filter(info["features"].__contains__, widths):
+        unused += _unknown_keys(info["features"][name], _FEATURE_KEYS, name, folder)
+    count = 0
+    for path in sorted(folder.glob("data/*/*.parquet")):
+        table = read_parquet(path)
+        known = {*info["features"], *_INDICES, *unused}
+        unused += [name for name in table.column_names if name not in known]
+        times, episodes, values, *environment = _number_columns(table, path, widths)
+        count += len(values)
+        for episode in dict.fromkeys(episodes[:, 0].tolist()):
+            rows = episodes[:, 0] == episode
+            columns: dict[str, Values] = {MESSAGE_TIME: times[rows, 0]}
+            columns |= {name: values[rows, k] for k, name in enumerate(names)}
+            columns |= {name: environment[0][rows, k] for name, k in parameters.items()}
+            if scene:
+                columns[OBSTACLE_POSES] = environment[0][rows][:, scene]
+            place = f"{folder}: episode {episode:g}"
+            _check_rate(place, columns[MESSAGE_TIME], info.get("fps"))
+            yield TrajectoryTable(place, columns, unused=tuple(unused))
+    if info.get("total_frames", count) != count:
+        stated = info["total_frames"]
+        raise UsageError(
+            f"{folder} has {count:,} frames, info.json states {stated!r:.60}"
+        )
+
+
+def _described_dataset(
+    folder: Path,
+) -> tuple[dict[str, Any], str, list[str], list[str]]:
+    """Return the description of a dataset, the feature of its states, and the names of states and environment."""
     try:
         info = parse_json(
             read_file(folder / LEROBOT_INFO, max_bytes=MAX_TABLE_BYTES).decode()
@@ -67,66 +113,22 @@ def read_lerobot(folder: Path) -> Iterator[TrajectoryTable]:
         raise UsageError(
             f"{folder} has LeRobot's format {version}, expected v3.0: convert it with LeRobot"
         )
-    parameters = {
-        name: k for k, name in enumerate(described) if name in PARAMETER_UNITS
-    }
-    scene = [k for k, name in enumerate(described) if _POSE_NAME.fullmatch(name)]
-    read = {key, *_INDICES, *([LEROBOT_ENVIRONMENT] if described else [])}
-    unused = [name for name in features if name not in read]
-    unused += [
-        f"{LEROBOT_ENVIRONMENT} {name}"
-        for k, name in enumerate(described)
-        if name not in parameters and k not in scene
-    ]
-    environment_key = [LEROBOT_ENVIRONMENT] if parameters or scene else []
-    unused += _unknown_keys(info, _INFO_KEYS, "info.json", folder)
-    described_columns = key, "timestamp", "episode_index", *environment_key
-    for name in filter(features.__contains__, described_columns):
-        unused += _unknown_keys(features[name], _FEATURE_KEYS, name, folder)
-    pattern, count = info.get("data_path", "data/"), 0
-    if not str(pattern).startswith("data/"):
+    pattern = str(info.get("data_path", "data/"))
+    if not pattern.startswith("data/"):
         raise UsageError(
             f"{folder}: data_path must begin with data/, got {pattern!r:.60}"
         )
-    for path in sorted(folder.glob("data/*/*.parquet")):
-        table = read_parquet(path)
-        unused += [
-            name
-            for name in table.column_names
-            if name not in features and name not in (*_INDICES, *unused)
-        ]
-        needed = (
-            "timestamp",
-            "episode_index",
-            key,
-            *environment_key,
-        )
-        missing = [name for name in needed if name not in table.column_names]
-        if missing:
-            raise UsageError(
-                f"{path}: there is no column {missing[0]!r}, only {', '.join(table.column_names)}"
-            )
-        widths = 1, 1, len(names), *([len(described)] if environment_key else [])
-        columns_of = zip(needed, widths, strict=True)
-        times, episodes, values, *environment = (
-            number_column(table, name, path, width) for name, width in columns_of
-        )
-        count += len(values)
-        for episode in dict.fromkeys(episodes[:, 0].tolist()):
-            rows = episodes[:, 0] == episode
-            columns: dict[str, Values] = {MESSAGE_TIME: times[rows, 0]}
-            columns |= {name: values[rows, k] for k, name in enumerate(names)}
-            columns |= {name: environment[0][rows, k] for name, k in parameters.items()}
-            if scene:
-                columns[OBSTACLE_POSES] = environment[0][rows][:, scene]
-            place = f"{folder}: episode {episode:g}"
-            _check_rate(place, columns[MESSAGE_TIME], info.get("fps"))
-            yield TrajectoryTable(place, columns, unused=tuple(unused))
-    if info.get("total_frames", count) != count:
-        stated = info["total_frames"]
+    return info, key, names, described
+
+
+def _number_columns(table: Any, path: Path, widths: Mapping[str, int]) -> list[Values]:
+    """Return the columns of a file with their numbers of values, shape (K, width) each."""
+    missing = [name for name in widths if name not in table.column_names]
+    if missing:
         raise UsageError(
-            f"{folder} has {count:,} frames, info.json states {stated!r:.60}"
+            f"{path}: there is no column {missing[0]!r}, only {', '.join(table.column_names)}"
         )
+    return [number_column(table, name, path, width) for name, width in widths.items()]
 
 
 def _unknown_keys(

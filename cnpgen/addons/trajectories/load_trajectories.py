@@ -104,28 +104,44 @@ def load_trajectories(
         "load_trajectories", options, LoadOptions(), old_keywords
     )
     record = problem_of_samples(problem)
-    names = _names(record, "joints", record.joint_names if joints is None else joints)
     _check_parameters(record, parameters or {})
     robot = open_problem(record)[1]
-    reading = ReadOptions(
-        joints=names,
-        velocities=()
-        if velocities is None
-        else _names(record, "velocities", velocities),
-        time=chosen.time,
-        degrees=chosen.unit == "deg",
-        rate=chosen.rate,
-        unwrap=chosen.unwrap,
-        drop_repeats=chosen.drop_repeats,
-        extrapolate=chosen.extrapolate,
-        separated=chosen.separate_by is not None,
-        parameters=parameters or {},
+    reading = _reading(record, chosen, joints, velocities, parameters or {})
+    tables, readers, trajectories = _read(path, record, chosen, reading, robot)
+    ignored = dict.fromkeys(name for reader in readers for name in reader.unused())
+    # Keys of messages may be missing in scenes; the other ones must be there.
+    keys = unmatched(chosen.allow_unused, [*ignored, *map(_key_of, ignored)])
+    _check_meaning(path, ignored, chosen.allow_unused)
+    if scenes is None:
+        check_allowed(keys, [], ignored)
+    if chosen.extrapolate:
+        record = _extrapolated(record, trajectories)
+    if scenes is not None:
+        elsewhere = sorted({*chosen.allow_unused}.difference(keys))
+        options_of_scenes = ReadingOptions(keys, allowed_elsewhere=elsewhere)
+        record, trajectories = with_scenes(
+            record, trajectories, scenes, options=options_of_scenes
+        )
+    places = tuple(table.place for table in tables)
+    notes = dict.fromkeys(note for reader in readers for note in reader.notes)
+    return LoadedTrajectories(
+        record, trajectories, places, tuple(ignored), tuple(notes)
     )
+
+
+def _read(
+    path: str | Path,
+    record: ProblemRecord,
+    options: LoadOptions,
+    reading: ReadOptions,
+    robot: Robot,
+) -> tuple[list[TrajectoryTable], list[TableReader], tuple[Trajectory, ...]]:
+    """Return the tables of a file, their readers and their trajectories."""
     try:
         tables = [
             part
-            for table in read_trajectory_tables(Path(path), chosen)
-            for part in _separated(table, chosen.separate_by)
+            for table in read_trajectory_tables(Path(path), options)
+            for part in _separated(table, options.separate_by)
         ]
         readers = [
             TableReader(table, record, reading, robot.velocity_limit)
@@ -135,44 +151,64 @@ def load_trajectories(
     except UsageError as error:
         error.argument = error.argument or "path"
         raise
-    if not trajectories:
-        raise UsageError(f"{path} holds no trajectory", concerns="path")
-    if chosen.topic is not None and not has_bags(Path(path)):
-        text = f"is for bags of ROS, got {path}, which is none"
-        raise UsageError(text, argument="topic")
-    if chosen.unit is not None and not any(reader.lacks_unit for reader in readers):
+    _check_trajectories(path, options, robot, trajectories)
+    if options.unit is not None and not any(reader.lacks_unit for reader in readers):
         text = "is for columns without a unit: all columns of joints state theirs"
         raise UsageError(text, argument="unit")
-    if chosen.unit != "deg":
-        _check_unit(path, robot, [trajectory.q for trajectory in trajectories])
     for reader, trajectory in zip(readers, trajectories, strict=True):
         reader.check_units(trajectory)
-    ignored = dict.fromkeys(name for reader in readers for name in reader.unused())
-    # Keys of messages may be missing in scenes; the other ones must be there.
-    keys = unmatched(chosen.allow_unused, [*ignored, *map(_key_of, ignored)])
-    _check_meaning(path, ignored, chosen.allow_unused)
-    if scenes is None:
-        check_allowed(keys, [], ignored)
-    if chosen.extrapolate:
-        values = [each.parameters for each in trajectories]
-        stated = [row for row in values if row is not None]
-        record = extrapolated_record(record, np.array(stated)) if stated else record
-    if scenes is not None:
-        record, trajectories = with_scenes(
-            record,
-            trajectories,
-            scenes,
-            options=ReadingOptions(
-                keys, allowed_elsewhere=sorted({*chosen.allow_unused}.difference(keys))
-            ),
-        )
-    return LoadedTrajectories(
-        record,
-        trajectories,
-        tuple(table.place for table in tables),
-        tuple(ignored),
-        tuple(dict.fromkeys(note for reader in readers for note in reader.notes)),
+    return tables, readers, trajectories
+
+
+def _reading(
+    record: ProblemRecord,
+    options: LoadOptions,
+    joints: Sequence[str] | None,
+    velocities: Sequence[str] | None,
+    parameters: Mapping[str, float],
+) -> ReadOptions:
+    """Return the options of the reader of one table."""
+    return ReadOptions(
+        joints=_names(
+            record, "joints", record.joint_names if joints is None else joints
+        ),
+        velocities=()
+        if velocities is None
+        else _names(record, "velocities", velocities),
+        time=options.time,
+        degrees=options.unit == "deg",
+        rate=options.rate,
+        unwrap=options.unwrap,
+        drop_repeats=options.drop_repeats,
+        extrapolate=options.extrapolate,
+        separated=options.separate_by is not None,
+        parameters=parameters,
     )
+
+
+def _extrapolated(
+    record: ProblemRecord, trajectories: Iterable[Trajectory]
+) -> ProblemRecord:
+    """Return the problem with ranges of parameters that contain those of the trajectories."""
+    values = [each.parameters for each in trajectories]
+    stated = [row for row in values if row is not None]
+    return extrapolated_record(record, np.array(stated)) if stated else record
+
+
+def _check_trajectories(
+    path: str | Path,
+    options: LoadOptions,
+    robot: Robot,
+    trajectories: Sequence[Trajectory],
+) -> None:
+    """Check that a file holds trajectories, of the kind and the unit that the options say."""
+    if not trajectories:
+        raise UsageError(f"{path} holds no trajectory", concerns="path")
+    if options.topic is not None and not has_bags(Path(path)):
+        text = f"is for bags of ROS, got {path}, which is none"
+        raise UsageError(text, argument="topic")
+    if options.unit != "deg":
+        _check_unit(path, robot, [trajectory.q for trajectory in trajectories])
 
 
 def _key_of(name: str) -> str:
@@ -232,61 +268,67 @@ def _separated(
     table: TrajectoryTable, separate_by: str | None
 ) -> Iterator[TrajectoryTable]:
     """Yield the trajectories of a table: groups of rows, or the first axis of three."""
-    lengths = {len(values) for values in table.columns.values() if values.ndim}
-    stacked = {
-        name: values for name, values in table.columns.items() if values.ndim == 3
-    }
+    stacked = [values for values in table.columns.values() if values.ndim == 3]
     if separate_by is not None:
-        if separate_by not in table.columns or table.columns[separate_by].ndim != 1:
-            raise UsageError(
-                f"{table.place}: there is no column {separate_by!r}, only {', '.join(table.columns)}"
-            )
-        if len(lengths) != 1:
-            raise UsageError(
-                f"{table.place}: columns must have one value per row each, got {sorted(lengths)} values"
-            )
-        key = table.columns[separate_by]
-        first = np.flatnonzero(np.append(True, key[1:] != key[:-1])).tolist()
-        begun = Counter[Any]()
-        for low, high in pairwise([*first, len(key)]):
-            value = key[low].item()
-            begun[value] += 1
-            again = f", part {begun[value]}" if begun[value] > 1 else ""
-            rows = {
-                name: values[low:high] if values.ndim else values
-                for name, values in table.columns.items()
-                if name != separate_by
-            }
-            yield replace(
-                table,
-                place=f"{table.place}: {separate_by} {value}{again}",
-                columns=rows,
-                lines=table.lines[low:high],
-            )
+        yield from _groups_of_rows(table, separate_by)
     elif stacked:
-        count = len(next(iter(stacked.values())))
+        count = len(stacked[0])
         for index in range(count):
-            parts = {
-                name: values[index]
-                if values.ndim == 3 or (values.ndim == 2 and len(values) == count)
-                else values
-                for name, values in table.columns.items()
-                if values.ndim == 3 or plain(name) in TIME_NAMES
-            }
-            of_all = {
-                name: values
-                for name, values in table.columns.items()
-                if plain(name) in PARAMETER_UNITS
-            }
-            parts |= {
-                name: values[index] if values.shape == (count,) else values
-                for name, values in of_all.items()
-            }
-            yield TrajectoryTable(
-                f"{table.place}: trajectory {index}", parts, table.joint_names
-            )
+            yield _of_stack(table, index, count)
     else:
         yield table
+
+
+def _groups_of_rows(
+    table: TrajectoryTable, separate_by: str
+) -> Iterator[TrajectoryTable]:
+    """Yield groups of consecutive rows with one value of a column."""
+    lengths = {len(values) for values in table.columns.values() if values.ndim}
+    if separate_by not in table.columns or table.columns[separate_by].ndim != 1:
+        raise UsageError(
+            f"{table.place}: there is no column {separate_by!r}, only {', '.join(table.columns)}"
+        )
+    if len(lengths) != 1:
+        raise UsageError(
+            f"{table.place}: columns must have one value per row each, got {sorted(lengths)} values"
+        )
+    key = table.columns[separate_by]
+    first = np.flatnonzero(np.append(True, key[1:] != key[:-1])).tolist()
+    begun = Counter[Any]()
+    for low, high in pairwise([*first, len(key)]):
+        value = key[low].item()
+        begun[value] += 1
+        again = f", part {begun[value]}" if begun[value] > 1 else ""
+        rows = {
+            name: values[low:high] if values.ndim else values
+            for name, values in table.columns.items()
+            if name != separate_by
+        }
+        yield replace(
+            table,
+            place=f"{table.place}: {separate_by} {value}{again}",
+            columns=rows,
+            lines=table.lines[low:high],
+        )
+
+
+def _of_stack(table: TrajectoryTable, index: int, count: int) -> TrajectoryTable:
+    """Return one of the trajectories that are stacked along the first axis."""
+    parts = {
+        name: values[index]
+        if values.ndim == 3 or (values.ndim == 2 and len(values) == count)
+        else values
+        for name, values in table.columns.items()
+        if values.ndim == 3 or plain(name) in TIME_NAMES
+    }
+    parts |= {
+        name: values[index] if values.shape == (count,) else values
+        for name, values in table.columns.items()
+        if plain(name) in PARAMETER_UNITS
+    }
+    return TrajectoryTable(
+        f"{table.place}: trajectory {index}", parts, table.joint_names
+    )
 
 
 def _check_parameters(record: ProblemRecord, parameters: Mapping[str, float]) -> None:

@@ -58,21 +58,6 @@ class Trajectory:
                     concerns="ddq",
                 )
             ddq = checked_samples(t, q, self.ddq)[2]
-        parameters = (
-            None if self.parameters is None else numbers("parameters", self.parameters)
-        )
-        if parameters is not None and parameters.ndim != 1:
-            raise UsageError(
-                f"must have shape (p,), got {parameters.shape}", argument="parameters"
-            )
-        poses = self.obstacle_poses
-        if poses is not None:
-            poses = numbers("obstacle_poses", poses)
-            if poses.ndim != 1:
-                raise UsageError(
-                    f"must have shape (width,), got {poses.shape}",
-                    argument="obstacle_poses",
-                )
         phase = None if self.phase is None else numbers("phase", self.phase)
         if phase is not None:
             _check_phase(phase, len(t))
@@ -81,9 +66,9 @@ class Trajectory:
             "q": q,
             "dq": dq,
             "ddq": ddq,
-            "parameters": parameters,
+            "parameters": _vector("parameters", self.parameters, "p"),
             "phase": phase,
-            "obstacle_poses": poses,
+            "obstacle_poses": _vector("obstacle_poses", self.obstacle_poses, "width"),
         }
         for name, values in arrays.items():
             object.__setattr__(self, name, values)  # lists become arrays
@@ -150,6 +135,18 @@ class Trajectory:
 
         parts = [part for part in (self.q, self.dq, self.ddq) if part is not None]
         return BPoly.from_derivatives(self.t, np.stack(parts, axis=1))
+
+
+def _vector(name: str, values: Array | None, size: str) -> Array | None:
+    """Return numbers of one axis, whose size has a name in errors."""
+    if values is None:
+        return None
+    checked = numbers(name, values)
+    if checked.ndim != 1:
+        raise UsageError(
+            f"must have shape ({size},), got {checked.shape}", argument=name
+        )
+    return checked
 
 
 def _check_phase(phase: Array, count: int) -> None:

@@ -70,6 +70,13 @@ def add_trajectory_options(option: Options) -> None:
     add("--separator", metavar="TEXT", help=text)
     text = "column whose value differs from trajectory to trajectory"
     add("--separate-by", metavar="COLUMN", help=text)
+    _add_repairs(option)
+    _add_context_options(option)
+
+
+def _add_repairs(option: Options) -> None:
+    """Add the options that change samples."""
+    add = option.add_argument
     add(
         "--unwrap",
         action="store_true",
@@ -83,15 +90,14 @@ def add_trajectory_options(option: Options) -> None:
         help="drop rows that repeat the time and the positions of the row before",
     )
 
+
+def _add_context_options(option: Options) -> None:
+    """Add the options that state what the file does not have, or has too much."""
+    add = option.add_argument
     text = "values of the problem's parameters that the file does not have, such as payload_mass=6kg"
     add("--parameters", metavar="NAME=V,...", type=values.parameters, help=text)
     text = "obstacles around the trajectories: a file of scenes or of plans; one for each trajectory, or one for all"
-    add(
-        "--scenes",
-        metavar="FILE",
-        type=recipe_names.present,
-        help=text,
-    )
+    add("--scenes", metavar="FILE", type=recipe_names.present, help=text)
     text = "topic of a bag of ROS, if several have trajectories"
     add("--topic", metavar="NAME", help=text)
     text = "element of a message or scene that may be left unused; may be repeated"
@@ -194,6 +200,23 @@ def summary_text(file: Path, found: "TrajectoryEvaluation") -> str:
     if found.assumed_errors:
         lines.append("  a sensor has more: --noise and --time-jitter state it")
     lines.append("")
+    summary = found.summary()
+    if summary["conditions"]:
+        lines += _condition_tables(found, summary["conditions"])
+    # Of each reason, the first proof is printed.
+    proofs = {v.reason: f": {v.detail}" for v in reversed(found.verdicts) if v.detail}
+    lines.append("")
+    for reason, count in summary["reasons"].items():
+        lines.append(f"  {count:,} because of: {reason}{proofs.get(reason, '')}")
+    if CONTRADICTION in summary["reasons"]:
+        lines.append("  --ignore-velocities judges the positions alone")
+    return "\n".join(lines).rstrip()
+
+
+def _condition_tables(
+    found: "TrajectoryEvaluation", conditions: dict[str, dict[str, int]]
+) -> list[str]:
+    """Return the table of decisions about conditions, and that of their worst margins."""
     decided: list[tuple[str, ...]] = [
         (
             "condition",
@@ -206,8 +229,7 @@ def summary_text(file: Path, found: "TrajectoryEvaluation") -> str:
         )
     ]
     margins = [margin_head("condition", item="trajectory")]
-    summary = found.summary()
-    for name, decisions in summary["conditions"].items():
+    for name, decisions in conditions.items():
         entries = [
             (index, v.conditions[name])
             for index, v in enumerate(found.verdicts)
@@ -225,17 +247,11 @@ def summary_text(file: Path, found: "TrajectoryEvaluation") -> str:
         ]
         decided.append((name, *counted, *shares, ""))
         margins.append((name, *margin_cells(entry.to_dict()["margin"], worst)))
-    if summary["conditions"]:
-        lines += [*table(decided, indent="  ", right=(1, 2, 3, 4, 5)), ""]
-        lines += table(margins, indent="  ", right=(1, 2, 3, 5, 6))
-    # Of each reason, the first proof is printed.
-    proofs = {v.reason: f": {v.detail}" for v in reversed(found.verdicts) if v.detail}
-    lines.append("")
-    for reason, count in summary["reasons"].items():
-        lines.append(f"  {count:,} because of: {reason}{proofs.get(reason, '')}")
-    if CONTRADICTION in summary["reasons"]:
-        lines.append("  --ignore-velocities judges the positions alone")
-    return "\n".join(lines).rstrip()
+    return [
+        *table(decided, indent="  ", right=(1, 2, 3, 4, 5)),
+        "",
+        *table(margins, indent="  ", right=(1, 2, 3, 5, 6)),
+    ]
 
 
 def _largest(shares: list[float | None]) -> str:

@@ -6,7 +6,7 @@ the state moved by its bound, one by one and in random combinations. The sum of 
 changes, times a safety factor for curvature, bounds the error.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -148,81 +148,85 @@ def _changes(  # noqa: PLR0917 - as of uncertainty_of
     starts: NDArray[np.intp],
 ) -> list[Array]:
     """Bound the errors of smooth conditions in every block, shape (m, B) each."""
-    # Twice the middle of every block.
-    centers = np.append(starts[1:], len(s)) + starts
-    at = s[centers // 2]
-    states = [
-        values
-        for values in vars(family.evaluate(at, jerk=problem.uses_jerk)).values()
-        if values is not None
-    ]
+    # The middle of every block.
+    at = s[(np.append(starts[1:], len(s)) + starts) // 2]
+    evaluated = family.evaluate(at, jerk=problem.uses_jerk)
+    states = [values for values in vars(evaluated).values() if values is not None]
     # The largest bound of a block applies to its middle.
     bounds = [
         np.maximum.reduceat(values, starts, axis=1)
         for values in family.bounds_at(s)[: len(states)]
     ]
-    # Used by the relaxation only.
-    start_tip = np.zeros(3)
-
-    def values(
-        offsets: Sequence[Array], obstacle_poses: Array = scenes[0]
-    ) -> list[Array]:
-        moved = EvaluatedTrajectory(
-            *(state + offset for state, offset in zip(states, offsets, strict=True))
-        )
-        world.set_path(moved.q, moved.dq, moved.ddq, obstacle_poses, moved.jerk)
-        every = {
-            _key(condition): condition.g
-            for constraint in {
-                id(condition.constraint): condition.constraint for condition in smooth
-            }.values()
-            for condition in measure(constraint, world, at, start_tip)
-        }
-        return [every[_key(condition)] for condition in smooth]
-
     still = [np.zeros_like(state) for state in states]
-    nominal = values(still)
+    nominal = _values(world, smooth, at, states, scenes[0])
+
+    def changes(offsets: Sequence[Array], scene: Array = scenes[0]) -> list[Array]:
+        moved = [state + offset for state, offset in zip(states, offsets, strict=True)]
+        found = _values(world, smooth, at, moved, scene)
+        return [np.abs(g - g0) for g, g0 in zip(found, nominal, strict=True)]
+
     total = [np.zeros_like(g) for g in nominal]
-    # First-order effects: each value moves alone, in both directions, and changes add
-    # up.
-    for order, bound in enumerate(bounds):
-        for joint in np.flatnonzero(bound.any(axis=1)).tolist():
-            changes = []
-            for sign in (-1, 1):
-                offsets = [offset.copy() for offset in still]
-                offsets[order][joint] = sign * bound[joint]
-                changes.append(
-                    [
-                        np.abs(g - g0)
-                        for g, g0 in zip(values(offsets), nominal, strict=True)
-                    ]
-                )
-            total = [
-                row + np.maximum(low, high)
-                for row, low, high in zip(total, *changes, strict=True)
-            ]
-    # Only one of the scenes is the true one: changes by scenes are not summed.
-    of_scenes = [np.zeros_like(g) for g in nominal]
-    for scene in scenes[1:]:
-        differences = [
-            np.abs(g - g0) for g, g0 in zip(values(still, scene), nominal, strict=True)
-        ]
-        of_scenes = [
-            np.maximum(row, change)
-            for row, change in zip(of_scenes, differences, strict=True)
-        ]
-    total = [
-        row + SCENE_FACTOR * change
-        for row, change in zip(total, of_scenes, strict=True)
-    ]
+    _add_single_changes(total, changes, bounds)
+    _add_scene_changes(total, [changes(still, scene) for scene in scenes[1:]])
     # A fixed seed gives equal verdicts for equal samples.
     random = np.random.default_rng(0)
     for _ in range(COMBINATIONS):
         offsets = [bound * random.choice([-1.0, 1.0], bound.shape) for bound in bounds]
-        for row, g, g0 in zip(total, values(offsets), nominal, strict=True):
-            # Effects of several values may exceed the sum of single ones where they
-            # interact.
-            np.maximum(row, np.abs(g - g0), out=row)
+        # Effects of several values may exceed the sum of single ones where they
+        # interact.
+        _raise_to(total, changes(offsets))
     return [
         CURVATURE_FACTOR * np.where(np.isfinite(row), row, UNDEFINED) for row in total
     ]
+
+
+def _values(
+    world: PathWorld,
+    conditions: Sequence[MeasuredCondition],
+    s: Array,
+    states: Sequence[Array],
+    scene: Array,
+) -> list[Array]:
+    """Measure conditions again at phases s in other states; return their values, shape (m, K) each."""
+    moved = EvaluatedTrajectory(*states)
+    world.set_path(moved.q, moved.dq, moved.ddq, scene, moved.jerk)
+    constraints = {id(each.constraint): each.constraint for each in conditions}
+    # The position of the tip at the start is used by the relaxation only.
+    every = {
+        _key(condition): condition.g
+        for constraint in constraints.values()
+        for condition in measure(constraint, world, s, np.zeros(3))
+    }
+    return [every[_key(condition)] for condition in conditions]
+
+
+def _add_single_changes(
+    total: Sequence[Array],
+    changes: Callable[[Sequence[Array]], list[Array]],
+    bounds: Sequence[Array],
+) -> None:
+    """Add first-order effects: each value moves alone, in both directions, and changes add up."""
+    for order, bound in enumerate(bounds):
+        for joint in np.flatnonzero(bound.any(axis=1)).tolist():
+            both = []
+            for sign in (-1, 1):
+                offsets = [np.zeros_like(each) for each in bounds]
+                offsets[order][joint] = sign * bound[joint]
+                both.append(changes(offsets))
+            for row, low, high in zip(total, *both, strict=True):
+                np.add(row, np.maximum(low, high), out=row)
+
+
+def _add_scene_changes(
+    total: Sequence[Array], changes: Sequence[Sequence[Array]]
+) -> None:
+    """Add the largest of the changes by scenes: only one of these is the true one, so they are not summed."""
+    if changes:
+        for row, *of_scenes in zip(total, *changes, strict=True):
+            np.add(row, SCENE_FACTOR * np.max(of_scenes, axis=0), out=row)
+
+
+def _raise_to(total: Sequence[Array], changes: Sequence[Array]) -> None:
+    """Replace totals by the changes that exceed them."""
+    for row, change in zip(total, changes, strict=True):
+        np.maximum(row, change, out=row)

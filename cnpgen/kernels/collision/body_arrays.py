@@ -191,47 +191,54 @@ def _fill(body: Any, obstacle: Obstacle, numbers: Array) -> tuple[Array, Array]:
 
     Return center and half sizes of its bounding box without radius.
     """
+    if not obstacle.upright:
+        return _fill_placed(body, obstacle, numbers)
+    (solid,) = solids_of([obstacle], numbers)
+    center = (solid.low + solid.high) / 2
+    half = (solid.high - solid.low) / 2
+    body["kind"] = BOX
+    body["size"] = half
+    body["position"] = center
+    body["rotation"] = np.eye(3).ravel()
+    return center, half
+
+
+def _fill_placed(body: Any, obstacle: Obstacle, numbers: Array) -> tuple[Array, Array]:
+    """Fill in an obstacle with a position and, depending on its kind, a rotation or an axis."""
     rotation = np.eye(3)
     half = np.zeros(3)
-    if obstacle.upright:
-        (solid,) = solids_of([obstacle], numbers)
-        center = (solid.low + solid.high) / 2
-        half = (solid.high - solid.low) / 2
+    center = numbers[:3]
+    rest = numbers[3:]
+    if obstacle.kind == "box":
+        half = rest[:3]
+        rotation = rest[3:].reshape(3, 3) if obstacle.is_turned else rotation
         body["kind"] = BOX
         body["size"] = half
+    elif obstacle.kind == "sphere":
+        body["kind"] = BOX
+        body["radius"] = rest[0]
+    elif obstacle.kind == "mesh":
+        body["kind"] = HULL
+        rotation = rest.reshape(3, 3)
+        corners = corners_of(obstacle.mesh)
+        low = corners.min(axis=0)
+        high = corners.max(axis=0)
+        body["position"] = center
+        body["rotation"] = rotation.ravel()
+        # The bounding box of a mesh is that of its corners in the mesh's own frame.
+        return center + rotation @ (low + high) / 2, (high - low) / 2
     else:
-        center = numbers[:3]
-        rest = numbers[3:]
-        if obstacle.kind == "box":
-            half = rest[:3]
-            rotation = rest[3:].reshape(3, 3) if obstacle.is_turned else rotation
-            body["kind"] = BOX
-            body["size"] = half
-        elif obstacle.kind == "sphere":
-            body["kind"] = BOX
-            body["radius"] = rest[0]
-        elif obstacle.kind == "mesh":
-            body["kind"] = HULL
-            rotation = rest.reshape(3, 3)
-            corners = corners_of(obstacle.mesh)
-            low = corners.min(axis=0)
-            high = corners.max(axis=0)
-            body["position"] = center
-            body["rotation"] = rotation.ravel()
-            # The bounding box of a mesh is that of its corners in the mesh's own frame.
-            return center + rotation @ (low + high) / 2, (high - low) / 2
+        length = math.hypot(*rest[:3])
+        rotation = frame_along(rest[:3].tolist(), length)
+        if obstacle.kind == "cylinder":
+            half = np.array([rest[3], rest[3], length])
+            body["kind"] = CYLINDER
+            body["radius"] = 0.0
         else:
-            length = math.hypot(*rest[:3])
-            rotation = frame_along(rest[:3].tolist(), length)
-            flat = obstacle.kind == "cylinder"
-            half = (
-                np.array([rest[3], rest[3], length])
-                if flat
-                else np.array([0.0, 0.0, length])
-            )
-            body["kind"], body["size"], body["radius"] = (
-                (CYLINDER, half, 0.0) if flat else (BOX, half, rest[3])
-            )
+            half = np.array([0.0, 0.0, length])
+            body["kind"] = BOX
+            body["radius"] = rest[3]
+        body["size"] = half
     body["position"] = center
     body["rotation"] = rotation.ravel()
     return center, half

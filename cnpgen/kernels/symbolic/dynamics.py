@@ -113,13 +113,10 @@ def inverse_dynamics(
         # The nominal payload belongs to the last body already; a load adds its
         # difference.
         assert payload is not None
-        (force, torque), (more_force, more_torque) = (
-            wrenches[-1],
-            _load_wrench(chain, payload, load, motions[-1]),
-        )
+        more = _load_wrench(chain, payload, load, motions[-1])
         wrenches[-1] = (
-            add(force, scale(more_force, load.share)),
-            add(torque, scale(more_torque, load.share)),
+            add(wrenches[-1][0], scale(more[0], load.share)),
+            add(wrenches[-1][1], scale(more[1], load.share)),
         )
     # Inward: the joint carries the wrenches of all bodies beyond it. Its torque is the
     # component along its axis.
@@ -132,8 +129,7 @@ def inverse_dynamics(
         force = add(force, wrench[0])
         torque = add(torque, wrench[1])
         torques.append(dot(constants(joint.axis), force if joint.prismatic else torque))
-        # Into the frame of the previous joint; the lever arm is the offset of the
-        # frame.
+        # Into the frame of the previous joint; the lever arm is the frame's offset.
         force = times(motion.rotation, force)
         torque = add(times(motion.rotation, torque), cross(motion.offset, force))
     return torques[::-1]

@@ -259,12 +259,12 @@ class Axis(TipAxis):
         self, u: Sequence[Any], omega: Sequence[Any], alpha: Sequence[Any]
     ) -> tuple[Condition, ...]:
         """Return the rates of the axis u orthogonal to the direction, from ``w x u`` and ``a x u + w x (w x u)``."""
+        from cnpgen.kernels.symbolic.linalg import add, cross
+
         # du/dt = w x u; its derivative a x u + w x (w x u) is the acceleration of the
         # axis.
-        rate = _cross(omega, u)
-        second = [
-            a + b for a, b in zip(_cross(alpha, u), _cross(omega, rate), strict=True)
-        ]
+        rate = cross(omega, u)
+        second = add(cross(alpha, u), cross(omega, rate))
         zero = np.zeros(2)
         rows = self.across
         return (
@@ -319,11 +319,3 @@ def _cosine(angle: Any) -> Any:
         if isinstance(angle, float)
         else ca.cos(ca.fmin(angle, np.pi))
     )
-
-
-def _cross(a: Sequence[Any], b: Sequence[Any]) -> list[Any]:
-    return [
-        a[1] * b[2] - a[2] * b[1],
-        a[2] * b[0] - a[0] * b[2],
-        a[0] * b[1] - a[1] * b[0],
-    ]

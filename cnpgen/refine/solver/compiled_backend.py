@@ -199,11 +199,6 @@ class CompiledBackend:
             if selection.multipliers is None
             else np.ascontiguousarray(selection.multipliers.T)
         )
-        addresses = (
-            address_of(missed),
-            None if before is None else address_of(before),
-            address_of(selected),
-        )
         self._motion.violation = selection.violation
         self._activate()
         self._build(
@@ -214,14 +209,12 @@ class CompiledBackend:
             selection.max_distance,
             MAX_SPEED_DISTANCE,
             selection.max_log_rate_change,
-            *addresses,
+            address_of(missed),
+            None if before is None else address_of(before),
+            address_of(selected),
         )
-        return CompiledSubproblem(
-            self,
-            g,
-            selected.T,
-            penalty * selection.violation + ELASTIC_GRADIENT,
-        )
+        gradient = penalty * selection.violation + ELASTIC_GRADIENT
+        return CompiledSubproblem(self, g, selected.T, gradient)
 
     def solve(
         self,
@@ -279,17 +272,11 @@ class CompiledBackend:
         """Return the arrays and kernels that no step changes."""
         grid = motion.grid
         kernels = motion.kernels
-        groups = (
-            np.empty((0, 3))
-            if kernels.cost_term is None
-            else kernels.cost_term.groups(kernels.cost_counts)
-        )
+        groups = np.empty((0, 3))
+        if kernels.cost_term is not None:
+            groups = kernels.cost_term.groups(kernels.cost_counts)
         arrays = {
-            **{
-                name: values
-                for name, values in vars(motion.boundary).items()
-                if name != "parameters"
-            },
+            **vars(motion.boundary),
             "obstacle_poses": motion.poses_along,
             "time_basis": grid.time_basis,
             "time_weights": grid.time_weights,
@@ -301,17 +288,11 @@ class CompiledBackend:
             "nonsmooth": bounds.nonsmooth.T,
             "accelerated": bounds.accelerated,
         }
+        # The boundary's parameters are no field of the C structure.
+        del arrays["parameters"]
         fields: dict[str, Any] = {
             name: None if array is None else self._keep(array)
             for name, array in arrays.items()
-        }
-        fields |= {
-            "grid": self._bases(grid.bases),
-            "cost_bases": self._bases(grid.cost_bases),
-        }
-        fields |= {
-            "values": kernels.values.address,
-            "jacobian": kernels.jacobian.address,
         }
         if (cost := kernels.cost_residuals) is not None:
             fields |= {
@@ -320,6 +301,10 @@ class CompiledBackend:
             }
         return {
             **fields,
+            "grid": self._bases(grid.bases),
+            "cost_bases": self._bases(grid.cost_bases),
+            "values": kernels.values.address,
+            "jacobian": kernels.jacobian.address,
             "n_time_nodes": len(grid.time_weights),
             "n_cost_groups": len(groups),
         }

@@ -257,6 +257,11 @@ class _Iterate:
             self._try(step, subproblem.selected)
         if self.x is not self._start:
             self._violations.append(self.violation)
+        self._continue_if_stuck()
+        self.converged |= self._radius < MIN_RADIUS or self._is_stuck()
+
+    def _continue_if_stuck(self) -> None:
+        """Change what is minimized if violations do not decrease any more."""
         # A motion that is 1 % slower costs 1 % of its duration. Where the duration [s] is
         # larger than mu, a violation may pay for itself: raise mu above it.
         if self._is_stuck() and self._penalty < self.cost:
@@ -271,7 +276,6 @@ class _Iterate:
         ):
             self._stalled = True
             self._violations = [self.violation]
-        self.converged |= self._radius < MIN_RADIUS or self._is_stuck()
 
     def _restoration_weight(self) -> float:
         ratio = max(
@@ -333,18 +337,7 @@ class _Iterate:
         if np.isfinite(reduction) and (
             within_bound or reduction > ACCEPTED_RATIO * predicted
         ):
-            # Accepted by the bound alone: it shrinks, so that this cannot go on forever.
-            if reduction <= ACCEPTED_RATIO * predicted:
-                self._violation_bound *= BOUND_SHRINKAGE
-            # The models were good: enlarge the region if the step reached its edge.
-            if within_bound or reduction > GOOD_RATIO * predicted:
-                self._radius = (
-                    min(2.5 * self._radius, MAX_RADIUS)
-                    if size > 0.8 * self._radius
-                    else self._radius
-                )
-            elif reduction < POOR_RATIO * predicted:
-                self._radius *= 0.5
+            self._adapt_radius(reduction, predicted, size, within_bound=within_bound)
             self._cost_converged = (
                 max(abs(self.cost - cost), abs(gain)) < settings.cost_tolerance * cost
             )
@@ -362,6 +355,20 @@ class _Iterate:
                 self._check_midpoints()
         else:
             self._reject(self._bounds.violations(g), selected, size)
+
+    def _adapt_radius(
+        self, reduction: float, predicted: float, size: float, *, within_bound: bool
+    ) -> None:
+        """Adapt the trust region and the bound of the violation to an accepted step."""
+        # Accepted by the bound alone: it shrinks, so that this cannot go on forever.
+        if reduction <= ACCEPTED_RATIO * predicted:
+            self._violation_bound *= BOUND_SHRINKAGE
+        # The models were good: enlarge the region if the step reached its edge.
+        if within_bound or reduction > GOOD_RATIO * predicted:
+            if size > 0.8 * self._radius:
+                self._radius = min(2.5 * self._radius, MAX_RADIUS)
+        elif reduction < POOR_RATIO * predicted:
+            self._radius *= 0.5
 
     def _check_midpoints(self) -> None:
         """Continue within tighter bounds if residuals violate them between grid points."""
