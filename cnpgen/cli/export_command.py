@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from cnpgen.cli import recipe_names, values
-from cnpgen.cli.parser import Parser
+from cnpgen.cli.parser import Parser, refuse
 from cnpgen.errors import UsageError, counted, listed
 
 if TYPE_CHECKING:
@@ -88,6 +88,8 @@ def export(
     from cnpgen.problems.problem_record import open_problem
 
     exporter = load_exporter(arguments.to)
+    if not exporter.samples:
+        refuse(arguments, ["rate"], f"{{}} has no effect with --to {arguments.to}")
     rate = DEFAULT_RATE_HZ if arguments.rate is None else arguments.rate
     chosen, out = _chosen(plans, arguments), _place(arguments, exporter)
     target = _target(out, exporter)
@@ -109,8 +111,8 @@ def export(
     if not refused:
         record_request(target, request)
     of_all = f" of {exported.count + refused:,}" if refused else ""
-    text = f"exported {counted(exported.count, 'plan')}{of_all} at {rate:g} Hz"
-    print(text, file=sys.stderr)
+    at = f" at {rate:g} Hz" if exporter.samples else ""
+    print(f"exported {counted(exported.count, 'plan')}{of_all}{at}", file=sys.stderr)
     print(exported.files[0] if exporter.single_file else out)
     return 1 if refused else 0
 

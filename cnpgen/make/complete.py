@@ -21,6 +21,7 @@ from cnpgen.pipelines.pipeline import Pipeline, steps_of
 from cnpgen.pipelines.stages.stage import Context, load_context
 from cnpgen.plans.boundary_problems import plans_of_rows
 from cnpgen.plans.plans import Plans
+from cnpgen.plans.stated_units import refuse_other_units
 from cnpgen.problems.problem import Problem
 from cnpgen.problems.problem_record import extrapolated, record_problem
 from cnpgen.robots.plausible_values import UnitError, check_plausible
@@ -33,7 +34,6 @@ from cnpgen.store.files.csv_table import read_csv_table
 from cnpgen.store.files.hdf5 import open_hdf5
 from cnpgen.store.files.kind import is_hdf5
 from cnpgen.store.paths import HDF5_KINDS, require_file
-from cnpgen.store.stated_units import refuse_other_units
 
 
 @dataclass(frozen=True, eq=False)

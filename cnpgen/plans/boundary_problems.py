@@ -27,6 +27,7 @@ from cnpgen.plans.format import (
 from cnpgen.plans.plan_file import agreed_problem, errors_of_file, stored_problem
 from cnpgen.plans.plans import Plans, make_plans
 from cnpgen.plans.plausible import check_boundary_units
+from cnpgen.plans.stated_units import refuse_other_units
 from cnpgen.problems.problem import Problem
 from cnpgen.problems.problem_record import ProblemRecord, as_record, open_problem
 from cnpgen.robots.robot import Robot
@@ -46,7 +47,6 @@ from cnpgen.store.paths import HDF5_KINDS, require_file, require_folder
 from cnpgen.store.reader import StoredDataset, open_dataset
 from cnpgen.store.scene_table import OBSTACLE_POSES, SCENE_ID
 from cnpgen.store.shard import SHARD_FORMAT
-from cnpgen.store.stated_units import refuse_other_units
 from cnpgen.trajectory.boundary import Boundary, boundary_of
 
 CONTEXT = ("hit_angle", "hit_speed")  # dataset columns that plans keep

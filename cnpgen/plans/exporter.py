@@ -107,6 +107,7 @@ class Exporter(ABC):
             joints that are not planned.
         is_folder: Whether the output with all plans is a folder.
         uses_environment: Whether the format has goals, columns of the tasks and scenes.
+        samples: Whether the format has samples in time.
         ticks_per_s: Units of the format's times per second; None if they are floats.
             Plans are sampled at the times that the file states.
     """
@@ -115,6 +116,7 @@ class Exporter(ABC):
     single_file: ClassVar[bool] = False
     is_folder: ClassVar[bool] = False
     uses_environment: ClassVar[bool] = False
+    samples: ClassVar[bool] = True
     ticks_per_s: ClassVar[int | None] = None
 
     @abstractmethod

@@ -7,11 +7,11 @@ from enum import IntEnum
 from pathlib import Path
 
 from cnpgen.errors import DatasetError, listed
+from cnpgen.plans.stated_units import UNIT_ATTRIBUTES
 from cnpgen.store.field import Field
 from cnpgen.store.files.hdf5 import Hdf5
 from cnpgen.store.joint_units import units_of_joints
 from cnpgen.store.scene_table import OBSTACLE_POSES
-from cnpgen.store.stated_units import UNIT_ATTRIBUTES
 
 FORMAT = "cnpgen-plans"
 PLAN_FILE_VERSION = 1

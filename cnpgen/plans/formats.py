@@ -237,6 +237,7 @@ class PathSplines(Exporter):
 
     suffix = ".hdf5"
     single_file = True
+    samples = False
 
     def write(
         self, path: Path, plans: Iterable[SampledPlan], exported: ExportedSet

@@ -34,6 +34,7 @@ from cnpgen.plans.format import (
     report_unused,
 )
 from cnpgen.plans.plans import Plans, make_plans
+from cnpgen.plans.stated_units import refuse_other_units
 from cnpgen.plans.tips import correct_tips
 from cnpgen.problems.problem import Problem
 from cnpgen.problems.problem_file import load_problem
@@ -55,7 +56,6 @@ from cnpgen.store.files.hdf5 import Column, Hdf5, create_hdf5, open_hdf5
 from cnpgen.store.files.kind import PLANS
 from cnpgen.store.paths import ANY_HDF5, file_kind, require_file
 from cnpgen.store.shard import field_attributes
-from cnpgen.store.stated_units import refuse_other_units
 from cnpgen.trajectory.boundary import Boundary
 
 

@@ -87,6 +87,7 @@ WITHOUT_EFFECT = [
     ("docs --search puck --url", "--url has no effect with --search"),
     ("export {rows} --to npz --allow-unused x", "--allow-unused needs --scenes"),
     ("solve {rows} --objective effort=2 --weight 3", "the objective 'effort=2' has"),
+    ("solve {rows} --max-iterations 0 --deadline 9ms", "--deadline has no effect with"),
     ("solve {rows} --n 3 --n 4", "--n: given twice, 3 and 4: expected once"),
     ("solve {rows} -o a.h5 --out b.h5", "-o/--out: given twice, a.h5 and b.h5"),
     ("train {rows} -o a.h5 --seed 0 --seed 5", "--seed: given twice, 0 and 5"),

@@ -12,10 +12,10 @@ from cnpgen.addons.trajectories.table_units import plain
 from cnpgen.addons.trajectories.trajectory_table import TrajectoryTable, Values
 from cnpgen.errors import UsageError
 from cnpgen.plans.format import PHASE_COLUMN
+from cnpgen.plans.stated_units import UNIT_ATTRIBUTES
 from cnpgen.robots.parameter_ranges import PARAMETER_UNITS
 from cnpgen.store.files.archives import ArchiveError, read_arrays
 from cnpgen.store.files.hdf5 import open_hdf5
-from cnpgen.store.stated_units import UNIT_ATTRIBUTES
 
 JOINT_NAMES = "joint_names"  # array of an archive, dataset or attribute of HDF5
 MAX_ARCHIVE_BYTES = 1 << 29  # of the arrays of an archive as floats

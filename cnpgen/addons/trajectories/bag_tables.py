@@ -71,7 +71,8 @@ def read_bag(path: Path, options: LoadOptions) -> Iterator[TrajectoryTable]:
             topic = _topic(path, bag, options.topic)
             others = sorted({each.topic for each in bag.connections} - {topic})
             connections = [each for each in bag.connections if each.topic == topic]
-            _check_count(path, topic, sum(each.msgcount for each in connections))
+            stated = sum(each.msgcount for each in connections)
+            _check_count(path, topic, stated)
             messages = [
                 _plain(bag.deserialize(content, connection.msgtype))
                 for connection, _, content in bag.messages(connections)
@@ -83,6 +84,10 @@ def read_bag(path: Path, options: LoadOptions) -> Iterator[TrajectoryTable]:
         raise UsageError(
             f"{path} is not a bag, or is damaged: {error!r:.200}"
         ) from error
+    if len(messages) != stated:
+        raise UsageError(
+            f"{path} states {stated:,} messages of {topic}, and holds {len(messages):,}"
+        )
     place = f"{path}: {topic}"
     if _kind(connections[0]) == STATES:
         tables = [states_table(messages, place, options.allow_unused)]

@@ -22,7 +22,7 @@ from cnpgen.addons.trajectories.trajectory_options import (
     write_json,
 )
 from cnpgen.cli import values
-from cnpgen.cli.parser import Options
+from cnpgen.cli.parser import Options, refuse
 from cnpgen.cli.terminal import Meter
 from cnpgen.errors import UsageError
 
@@ -75,6 +75,10 @@ def run(arguments: argparse.Namespace) -> int:
         raise UsageError(
             "--tracking-error is for plans: --noise gives the error of sampled trajectories"
         )
+    if not arguments.plot:
+        refuse(arguments, ["plan"], "{} needs --plot")
+    if arguments.ignore_velocities:
+        refuse(arguments, ["velocities"], "{} has no effect with --ignore-velocities")
     problem = problem_of(arguments)
     loaded = load_file(arguments, problem)
     count = len(loaded.trajectories)

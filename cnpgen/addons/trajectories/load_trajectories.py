@@ -23,6 +23,7 @@ from cnpgen.addons.trajectories.trajectory_table import TrajectoryTable
 from cnpgen.addons.trajectories.trajectory_tables import read_trajectory_tables
 from cnpgen.arrays import Array
 from cnpgen.errors import UsageError, either, nearest
+from cnpgen.plans.stated_units import SCALE_ATTRIBUTES, UNIT_ATTRIBUTES
 from cnpgen.problems.problem import Problem
 from cnpgen.problems.problem_record import (
     ProblemRecord,
@@ -38,7 +39,6 @@ from cnpgen.schema.argument_types import checked_arguments
 from cnpgen.schema.old_keywords import with_old_keywords
 from cnpgen.store.dataset_spec import StoredProblem
 from cnpgen.store.files.accounted import MISSPELT, check_allowed, unmatched
-from cnpgen.store.stated_units import SCALE_ATTRIBUTES, UNIT_ATTRIBUTES
 
 # Elements beside columns that say what their numbers mean.
 _OF_NAMES = "joint_name", "joints", "names", "unit", "units"

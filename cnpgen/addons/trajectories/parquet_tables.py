@@ -13,9 +13,9 @@ from cnpgen.addons.trajectories.text_tables import text_array
 from cnpgen.addons.trajectories.trajectory_table import TrajectoryTable, Values
 from cnpgen.errors import UsageError, requires_extra
 from cnpgen.plans.format import JOINT_NAMES_KEY, PLAN_COLUMN
+from cnpgen.plans.stated_units import UNIT_ATTRIBUTES
 from cnpgen.store.files.atomic import read_file
 from cnpgen.store.files.size_limits import MAX_TABLE_BYTES, MAX_TEXT_ARRAY_BYTES
-from cnpgen.store.stated_units import UNIT_ATTRIBUTES
 
 MAX_PARQUET_VALUES = (
     25_000_000  # of a table: they take up to 50 bytes each while it is read

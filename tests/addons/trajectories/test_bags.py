@@ -145,6 +145,16 @@ def test_bags_without_trajectories_or_times_are_refused(tmp_path: Path) -> None:
         load_trajectories(tmp_path / "damaged.mcap", "airhockey")
 
 
+def test_a_bag_has_as_many_messages_as_it_states(tmp_path: Path) -> None:
+    path = write(tmp_path / "a", {"/plan": (PLAN, [trajectory()])}, "mcap")
+    metadata = path / "metadata.yaml"
+    text = metadata.read_text()
+    assert "message_count: 1\n" in text
+    metadata.write_text(text.replace("message_count: 1\n", "message_count: 2\n"))
+    with pytest.raises(UsageError, match=r"states 2 messages of /plan, and holds 1"):
+        load_trajectories(path, "airhockey")
+
+
 def test_bags_of_ros_1_are_read(tmp_path: Path) -> None:
     path = tmp_path / "a.bag"
     with rosbag1.Writer(path) as bag:

@@ -313,3 +313,25 @@ def test_a_unit_is_refused_where_all_columns_state_theirs(
     head = head.replace("joint_2 [rad]", "joint_2")
     np.savetxt(path, rows, "%.17g", ",", header=head, comments="")
     load_trajectories(path, "airhockey", options=LoadOptions(unit="rad"))
+
+
+@pytest.mark.parametrize(
+    ("words", "text"),
+    [
+        (["--plan", "0"], "--plan needs --plot"),
+        (
+            ["--ignore-velocities", "--velocities", "a,b,c,d,e,f"],
+            "--velocities has no effect with --ignore-velocities",
+        ),
+        (["--unit", "rad"], "--unit is for columns without a unit"),
+    ],
+)
+def test_options_without_effect_on_samples_are_refused(
+    tmp_path: Path, words: list[str], text: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    head = ",".join(["t [s]", *(f"{joint} [rad]" for joint in JOINTS)])
+    path = tmp_path / "a.csv"
+    rows = np.column_stack([T, Q])
+    np.savetxt(path, rows, "%.17g", ",", header=head, comments="")
+    assert main(["evaluate", str(path), "--problem", "airhockey", *words]) == 2
+    assert text in capsys.readouterr().err

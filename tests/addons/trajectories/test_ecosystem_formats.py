@@ -16,8 +16,9 @@ import scipy
 import yaml
 
 import cnpgen
+from cnpgen.cli.main import main
 from cnpgen.errors import UsageError
-from cnpgen.plans import Plans
+from cnpgen.plans import Plans, save_plans
 from cnpgen.plans.export import export_plans
 from cnpgen.plans.join import join_plans
 from cnpgen.trajectories import load_trajectories
@@ -56,6 +57,17 @@ def test_the_goal_of_a_controller_is_yaml_of_a_trajectory(
     loaded = load_trajectories(tmp_path / "goals", AIRHOCKEY)
     assert len(loaded.trajectories) == 3
     assert np.allclose(loaded.trajectories[2].q[-1], plans.boundary.goal_q[2])
+
+
+def test_a_rate_is_refused_for_splines(
+    plans: Plans, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    save_plans(tmp_path / "plans.h5", plans)
+    words = ["export", str(tmp_path / "plans.h5"), "-o", str(tmp_path / "x.hdf5")]
+    assert main([*words, "--to", "mpd", "--rate", "100"]) == 2
+    assert "--rate has no effect with --to mpd" in capsys.readouterr().err
+    assert main([*words, "--to", "mpd"]) == 0
+    assert "exported 3 plans\n" in capsys.readouterr().err
 
 
 def test_path_splines_are_those_of_scipy(plans: Plans, tmp_path: Path) -> None:
