@@ -129,6 +129,7 @@ def main() -> None:
         figures[name] = measure(*task)
         if chosen.base and (chosen.base / f"datasets/{name}.toml").exists():
             figures[name] |= measure_in(chosen.base, *task)
+        progress(f"{name}: {json.dumps(figures[name])}")
     variants = [PLANNER, NO_GUESS]
     if chosen.base:
         variants += [BASE + PLANNER, BASE + NO_GUESS]
