@@ -37,6 +37,7 @@ _TALLIES = {
 def summary_text(file: Path, found: "Evaluation") -> str:
     """Format the summary of all plans."""
     from cnpgen.judges.plans.sampling import MAX_TIME_SAMPLES
+    from cnpgen.problems.limit_sources import sources_line
 
     summary, count = found.summary(), len(found.verdicts)
     step = f"{1e3 * found.step:g} ms"
@@ -57,6 +58,7 @@ def summary_text(file: Path, found: "Evaluation") -> str:
             head,
             checksum_text(found.plans),
             *([f"torque: {found.judged_torque}"] if found.judged_torque else []),
+            *filter(None, [sources_line(found.limit_sources)]),
             "",
             *table(tallies, indent="  ", right=(1, 2)),
         ]
