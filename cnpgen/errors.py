@@ -8,6 +8,8 @@ from typing import Any
 
 # Characters of a message; exceptions of libraries may repeat the content of a file.
 MAX_LINE_LENGTH = 4000
+# Errors of a file that a message lists.
+MAX_ERROR_LINES = 30
 
 Spelling = Callable[[str, object], str]
 """Writes an argument with the value that a message proposes for it, None for any value."""
@@ -102,7 +104,10 @@ class RecipeError(CnpgenError):
         Exception.__init__(self, self.errors)
 
     def __str__(self) -> str:
-        return "\n".join(self.errors)
+        lines = list(self.errors[:MAX_ERROR_LINES])
+        if more := len(self.errors) - len(lines):
+            lines.append(f"and {more:,} more error{'s' * (more > 1)}")
+        return "\n".join(lines)
 
     @property
     def mistakes(self) -> tuple[str, ...]:

@@ -9,6 +9,7 @@ from cnpgen.robots.drive import DriveSpec as DriveSpec
 from cnpgen.robots.obstacle import Obstacle as Obstacle
 from cnpgen.robots.parameter_ranges import ParameterRanges as ParameterRanges
 from cnpgen.robots.robot_spec import HeldObject as HeldObject
+from cnpgen.robots.robot_spec import LimitSources as LimitSources
 from cnpgen.robots.robot_spec import LimitSpec as LimitSpec
 from cnpgen.robots.robot_spec import Payload as Payload
 from cnpgen.robots.robot_spec import RobotSpec as RobotSpec

@@ -37,6 +37,7 @@ _TALLIES = {
 def summary_text(file: Path, found: "Evaluation") -> str:
     """Format the summary of all plans."""
     from cnpgen.judges.plans.sampling import MAX_TIME_SAMPLES
+    from cnpgen.problems.limit_sources import sources_line
 
     summary = found.summary()
     count = len(found.verdicts)
@@ -58,6 +59,7 @@ def summary_text(file: Path, found: "Evaluation") -> str:
             head,
             checksum_text(found.plans),
             *([f"torque: {found.judged_torque}"] if found.judged_torque else []),
+            *filter(None, [sources_line(found.limit_sources)]),
             "",
             *table(tallies, indent="  ", right=(1, 2)),
         ]

@@ -19,6 +19,7 @@ from cnpgen.plans.format import PlanStatus
 from cnpgen.plans.plans import Plans
 from cnpgen.plans.tips import correct_tips
 from cnpgen.problems.constraints.joint import judged_torque
+from cnpgen.problems.limit_sources import LimitSource, judged_sources
 from cnpgen.problems.problem_record import open_problem
 from cnpgen.schema.argument_types import checked_arguments
 from cnpgen.schema.arguments import number, numbers
@@ -95,6 +96,11 @@ class Evaluation:
         problem, robot = open_problem(self.plans.problem)
         return judged_torque(problem.constraint, robot)
 
+    @cached_property
+    def limit_sources(self) -> dict[str, LimitSource]:
+        """Who states the limits that were judged: quantity -> source."""
+        return judged_sources(*open_problem(self.plans.problem))
+
     def summary(self) -> dict[str, Any]:
         """Return the summary of all plans for JSON ('cnpgen docs verdict')."""
         record = self.plans.problem
@@ -105,6 +111,9 @@ class Evaluation:
             "problem_sha256": record.comparable_sha256,
             "checksum": self.plans.checksum,
             **({"torque": self.judged_torque} if self.judged_torque else {}),
+            "limit_sources": {
+                name: source.to_dict() for name, source in self.limit_sources.items()
+            },
             "step_s": self.step,
             **(
                 {"tracking_error_rad": list(self.tracking_error)}

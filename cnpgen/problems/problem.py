@@ -467,7 +467,8 @@ class Problem:
         """Hash (sha256) of everything that kernels and plans of the problem depend on; the key of caches.
 
         It depends on the values of the object and not on a file. Only the title, the
-        version of the file's rules and the file paths are excluded.
+        version of the file's rules, the file paths and the sources of limits are
+        excluded.
         """
         content = json.dumps(
             without_labels(to_dict(self, label=_all_of)), sort_keys=True
@@ -526,6 +527,7 @@ FILES = (
     "decomposed",
     "hull_gap",
 )
+SOURCES = "sources"  # key of [limits] that only describes them
 
 
 def kept_folder() -> Path | None:
@@ -573,8 +575,13 @@ def _all_of(obj: object) -> dict[str, str]:
 
 
 def without_labels(problem: Mapping[str, Any]) -> dict[str, Any]:
-    """Remove title, version and file names from a resolved problem, which do not affect its motions."""
+    """Remove title, version, file names and sources of limits from a resolved problem: they do not affect its motions."""
     robot = {key: value for key, value in problem["robot"].items() if key not in FILES}
     labels = {"title", "version"}
     kept = {key: value for key, value in problem.items() if key not in labels}
-    return kept | {"robot": robot}
+    return kept | {"robot": robot, "limits": without_sources(problem["limits"])}
+
+
+def without_sources(limits: Mapping[str, Any]) -> dict[str, Any]:
+    """Remove the sources from resolved limits."""
+    return {key: value for key, value in limits.items() if key != SOURCES}

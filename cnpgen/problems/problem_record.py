@@ -18,7 +18,13 @@ from numpy.typing import ArrayLike
 from cnpgen.arrays import Array
 from cnpgen.errors import RecipeError, UsageError
 from cnpgen.problems.objectives import read_objective
-from cnpgen.problems.problem import FILES, Objective, Problem, resolved
+from cnpgen.problems.problem import (
+    FILES,
+    Objective,
+    Problem,
+    resolved,
+    without_sources,
+)
 from cnpgen.problems.problem_file import (
     load_problem_behind,
     names_of_stored_files,
@@ -169,7 +175,7 @@ class ProblemRecord(StoredProblem):
         """Hash (sha256) of the part that problems with comparable plans share: ``problem_sha256`` in files.
 
         Excluded are name and title, base configuration, suggested parametrization,
-        objective, and tolerances of constraints. It does not identify a problem; caches
+        objective, sources of limits, and tolerances of constraints. It does not identify a problem; caches
         must use ``Problem.identity``.
         """
         return canonical_sha256(_comparable(self))
@@ -401,4 +407,5 @@ def _comparable(record: ProblemRecord) -> dict[str, Any]:
         constraints[name] = {
             key: value for key, value in kind.items() if key not in _JUDGED_BY
         }
-    return kept | {"robot": robot, "constraint": constraints}
+    limits = without_sources(kept["limits"])
+    return kept | {"robot": robot, "limits": limits, "constraint": constraints}

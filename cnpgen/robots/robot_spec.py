@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
@@ -11,6 +12,7 @@ from cnpgen.robots.parameter_ranges import PAYLOAD_CENTRE, optional_key
 from cnpgen.schema.keys import PerJoint, Range, field
 
 GEOMETRIES = ("urdf", "paper-capsules")
+SOURCE = r"^(vendor|urdf|stated|guess): \S.*"  # of a limit: its basis, then a text
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -128,6 +130,28 @@ class RobotSpec:
             )
 
 
+def _source(doc: str) -> Any:
+    """Declare a key that says who states a limit."""
+    form = '"BASIS: TEXT" with a BASIS of vendor, urdf, stated or guess'
+    return optional_key(doc, default="", pattern=SOURCE, form=form)
+
+
+@dataclass(frozen=True, kw_only=True)
+class LimitSources:
+    """Who states each limit; 'cnpgen show' and verdicts repeat it.
+
+    Without an entry, limits of the URDF are the URDF's, limits by the rules of
+    'acceleration_rate' and of jerks are guessed, and other numbers are "not stated".
+    """
+
+    position: str = _source("source of the limits of joint positions")
+    velocity: str = _source("source of the limits of joint velocities")
+    acceleration: str = _source("source of the limits of joint accelerations")
+    jerk: str = _source("source of the limits of joint jerks")
+    torque: str = _source("source of the limits of joint torques")
+    motor: str = _source("source of the limits of motors in [drive]")
+
+
 @dataclass(frozen=True, kw_only=True)
 class LimitSpec:
     """Planning limits as fractions of the URDF's limits or of given limits."""
@@ -184,6 +208,7 @@ class LimitSpec:
         default="use",
         choices=("use", "ignore"),
     )
+    sources: LimitSources | None = optional_key("who states each limit")
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -10,7 +10,7 @@ import pytest
 
 from cnpgen.addons.benchmark.results_file import open_results
 from cnpgen.addons.online.moving_pucks import PuckModel
-from cnpgen.errors import MAX_LINE_LENGTH, DatasetError, RecipeError, UsageError
+from cnpgen.errors import MAX_ERROR_LINES, MAX_LINE_LENGTH, DatasetError, RecipeError, UsageError
 from cnpgen.plans import PlanStatus, load_plans, save_plans
 from cnpgen.plans.evaluate import evaluate_plans
 from cnpgen.plans.plans import screen
@@ -80,6 +80,14 @@ def test_a_long_line_of_a_recipe() -> None:
     error = RecipeError(["key" * MAX_LINE_LENGTH, "another"])
     assert [len(line) <= MAX_LINE_LENGTH for line in error.errors] == [True, True]
     assert RecipeError(error.errors).errors == error.errors
+
+
+def test_a_message_lists_a_limited_number_of_errors():
+    error = RecipeError([f"obstacle {k}: bad" for k in range(206)])
+    lines = str(error).splitlines()
+    assert len(lines) == MAX_ERROR_LINES + 1
+    assert lines[-1] == f"and {206 - MAX_ERROR_LINES} more errors"
+    assert len(error.errors) == 206
 
 
 @pytest.mark.parametrize("planned", [True, False])

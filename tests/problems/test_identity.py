@@ -22,7 +22,8 @@ from tests.examples.constraints import TipSpeed
 from tests.examples.models import untrained_model
 from tests.examples.shipped import PROBLEMS
 
-# Names, locations of files, how they are read and what was measured: only their content counts.
+# Names, locations of files, how they are read, what was measured and who states limits:
+# only their content counts.
 LABELS = {
     "title",
     "version",
@@ -30,6 +31,7 @@ LABELS = {
     "robot.srdf",
     "robot.convex_parts",
     "robot.hull_gap",
+    "limits.sources",
 }
 
 

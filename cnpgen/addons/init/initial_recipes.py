@@ -12,6 +12,11 @@ from cnpgen.addons.init.arm import Arm, ArmJoint, arm_notes, with_torques
 from cnpgen.addons.init.draws import comfortable_base, find_boxes
 from cnpgen.addons.init.joint_limits import StatedJointLimits
 from cnpgen.addons.init.link_overlaps import LinkOverlaps, resolve_overlaps
+from cnpgen.addons.init.stated_sources import (
+    INITIAL_JERK_RATE,
+    TORQUE_STATES,
+    stated_sources,
+)
 from cnpgen.arrays import Array
 from cnpgen.errors import RecipeError
 from cnpgen.make.recipe import DatasetRecipe
@@ -45,15 +50,10 @@ from cnpgen.store.files.accounted import check_allowed
 # Range of inverse kinematics guesses around the base configuration.
 GUESS_RANGE_RAD = 0.5
 GUESS_RANGE_M = 0.1
-# Jerk limits per acceleration limit [1/s]; Franka Research 3: 500 ('cnpgen docs
-# references').
-INITIAL_JERK_RATE = 100.0
 MAX_OVERLOAD = 10.0  # torque that gravity needs / torque limit of the URDF
 TORQUE_SCALE = 0.8  # planning limit / URDF limit of joint torques
 # Of the random states in which a joint's torque limit must suffice to hold the arm.
 MIN_HOLDING_FRACTION = 0.25
-# Random states that determine placeholders of missing torque limits.
-TORQUE_STATES = 1000
 
 
 @dataclass(frozen=True)
@@ -106,6 +106,8 @@ def problem_of(
     )
     problem = replace(problem, limits=limits)
     problem = _with_jerk_limits(problem, robot, joint_limits)
+    sources = stated_sources(arm, problem.limits, joint_limits)
+    problem = replace(problem, limits=replace(problem.limits, sources=sources))
     problem, torque_notes = _with_torque(problem, robot)
     base, base_notes = comfortable_base(problem, load_robot(problem))
     problem = replace(problem, robot=replace(problem.robot, base=base))

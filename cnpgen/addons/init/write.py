@@ -8,18 +8,10 @@ from pathlib import Path
 from textwrap import wrap
 from typing import Any
 
-from cnpgen.addons.init.arm import (
-    DEFAULT_RANGE_M,
-    DEFAULT_RANGE_RAD,
-    DEFAULT_SPEED,
-    Arm,
-)
-from cnpgen.addons.init.initial_recipes import (
-    INITIAL_JERK_RATE,
-    TORQUE_STATES,
-    InitialProblem,
-)
+from cnpgen.addons.init.arm import Arm
+from cnpgen.addons.init.initial_recipes import InitialProblem
 from cnpgen.addons.init.link_overlaps import MAX_PAIR_GAP, LinkOverlaps
+from cnpgen.addons.init.stated_sources import INITIAL_JERK_RATE, PLACEHOLDERS
 from cnpgen.addons.manual.describe import link_rows, pair_rows, with_units
 from cnpgen.addons.manual.describe_keys import GROUPS, is_array, kind_summary, part_of
 from cnpgen.cli.terminal import table
@@ -87,17 +79,10 @@ def _head(title: str) -> list[str]:
 
 def _notes(arm: Arm) -> Mapping[str, str]:
     """Say which values were put in the place of missing ones, and how others were found."""
-    ranges = f"{DEFAULT_RANGE_RAD:.3g} rad, or {DEFAULT_RANGE_M:g} m, to either side"
-    torques = f"the largest of {TORQUE_STATES:,} random states, at speeds and accelerations within the limits"
-    put = {
-        "position": ranges,
-        "velocity": f"{DEFAULT_SPEED:g} rad/s or m/s",
-        "torque": torques,
-    }
     base = "Found by sampling: in front of the robot, far from its limits, with high manipulability."
     jerk = f"{INITIAL_JERK_RATE:.0f}/s times the acceleration limits; a Franka Research 3 has 500/s. Look them up."
     notes = {"robot.home": base, "limits.jerk": jerk}
-    for what, instead in put.items():
+    for what, instead in PLACEHOLDERS.items():
         without = [joint.name for joint in arm.planned if what in joint.missing]
         if without:
             notes[f"limits.{what}"] = (

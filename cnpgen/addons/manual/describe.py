@@ -14,6 +14,7 @@ from cnpgen.pipelines.stages.stage import Stage
 from cnpgen.planner.model import Model
 from cnpgen.problems.constraints.constraint import Constraint
 from cnpgen.problems.constraints.joint import judged_torque
+from cnpgen.problems.limit_sources import WORDS, limit_sources
 from cnpgen.problems.load_robot import load_robot
 from cnpgen.problems.problem import Problem, resolved
 from cnpgen.problems.urdf_dynamics import friction_in, joint_notes
@@ -130,6 +131,9 @@ def describe_problem(problem: Problem) -> str:
             "",
             "  planning limits",
             *table(_limit_rows(problem, robot), indent="    "),
+            "",
+            "  sources of the limits",
+            *table(_source_rows(problem, robot), indent="    "),
             *_drive(problem, robot),
             *_shape(problem, robot),
             "",
@@ -314,14 +318,26 @@ def _limit_rows(problem: Problem, robot: Robot) -> list[tuple[str, ...]]:
         ("torque", "N m", [f"{x:.4g}" for x in robot.torque_limit]),
         ("base", "rad", [f"{x:.4g}" for x in robot.home]),
     ]
-    # The limit of jerks is shown where the problem uses it or states it.
-    spoken_of = problem.uses_jerk or problem.limits.jerk is not None
     shown = [
         (name, *with_units(robot.units(unit), cells))
         for name, unit, cells in columns
-        if spoken_of or name != "jerk"
+        if _shows_jerk(problem) or name != "jerk"
     ]
     return list(zip(("joint", "", *robot.joint_names), *shown, strict=True))
+
+
+def _source_rows(problem: Problem, robot: Robot) -> list[tuple[str, ...]]:
+    """List who states each limit; that of jerks as in the table of limits."""
+    return [
+        (name, WORDS[each.basis], each.source)
+        for name, each in limit_sources(problem, robot).items()
+        if _shows_jerk(problem) or name != "jerk"
+    ]
+
+
+def _shows_jerk(problem: Problem) -> bool:
+    """Return whether the limit of jerks is shown: where the problem uses it or states it."""
+    return problem.uses_jerk or problem.limits.jerk is not None
 
 
 def with_units(units: str, cells: Sequence[str]) -> tuple[str, ...]:
@@ -436,6 +452,9 @@ def recipe_to_dict(recipe: Recipe) -> dict[str, Any]:
     content["limits"] = {
         name: {"unit": robot.units(unit), "values": list(getattr(robot, name))}
         for name, unit in LIMITS.items()
+    }
+    content["limit_sources"] = {
+        name: source.to_dict() for name, source in limit_sources(problem, robot).items()
     }
     if torque := judged_torque(problem.constraint, robot):
         content["torque"] = torque

@@ -33,6 +33,7 @@ from cnpgen.errors import UsageError, counted
 from cnpgen.judges.plans.judge import check_step
 from cnpgen.plans.evaluate import MAX_VERDICT_STEP_S, judged_in_parts
 from cnpgen.problems.constraints.joint import judged_torque
+from cnpgen.problems.limit_sources import LimitSource, judged_sources
 from cnpgen.problems.problem import Problem
 from cnpgen.problems.problem_record import ProblemRecord, open_problem
 from cnpgen.robots.scene import Scene
@@ -99,6 +100,11 @@ class TrajectoryEvaluation:
         problem, robot = open_problem(self.problem)
         return judged_torque(problem.constraint, robot)
 
+    @property
+    def limit_sources(self) -> dict[str, LimitSource]:
+        """Who states the limits that were judged: quantity -> source."""
+        return judged_sources(*open_problem(self.problem))
+
     def summary(self) -> dict[str, Any]:
         """Return the summary of all trajectories for JSON ('cnpgen docs trajectories')."""
         conditions: dict[str, dict[str, Any]] = {}
@@ -114,6 +120,9 @@ class TrajectoryEvaluation:
             "problem": self.problem.name,
             "problem_sha256": self.problem.comparable_sha256,
             **({"torque": self.judged_torque} if self.judged_torque else {}),
+            "limit_sources": {
+                name: source.to_dict() for name, source in self.limit_sources.items()
+            },
             "step_s": self.step,
             "trajectories": len(self.verdicts),
             **self.counts,

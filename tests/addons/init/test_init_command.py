@@ -11,12 +11,14 @@ import cnpgen
 from cnpgen.addons.benchmark.run_suite import run_benchmark
 from cnpgen.addons.init import hull_gap, link_overlaps
 from cnpgen.addons.init.arm import read_arm
-from cnpgen.addons.init.initial_recipes import INITIAL_JERK_RATE, problem_of
+from cnpgen.addons.init.initial_recipes import problem_of
+from cnpgen.addons.init.stated_sources import INITIAL_JERK_RATE
 from cnpgen.addons.init.write import toml
 from cnpgen.addons.manual.describe_keys import part_of
 from cnpgen.cli.main import main
 from cnpgen.make.recipe import load_dataset_recipe
 from cnpgen.problems.constraints.joint import JointJerk
+from cnpgen.problems.limit_sources import limit_sources
 from cnpgen.problems.load_robot import load_robot
 from cnpgen.problems.problem import resolved
 from cnpgen.problems.problem_file import load_problem
@@ -142,6 +144,7 @@ def test_what_is_left_out_is_at_its_default(crane):
         "velocity_scale": 0.8,
         "torque_scale": 0.8,
         "jerk": said["limits"]["jerk"],
+        "sources": {"jerk": "guess: 100/s times the acceleration limits"},
     }
     assert said["robot"]["joints"] == ["swing", "lift", "elbow", "roll"]
     assert {"object", "payload", "obstacle"}.isdisjoint(said)
@@ -261,7 +264,15 @@ def test_limits_that_are_missing_are_put_in_and_said(tmp_path):
         .split()
     )
     assert text.count("The URDF has none for joint_1, joint_3: put in:") == 3
-    limits = load_problem(tmp_path / "bare" / "problem.toml").limits
+    problem = load_problem(tmp_path / "bare" / "problem.toml")
+    limits = problem.limits
+    for quantity in ("position", "velocity", "torque"):
+        text = getattr(limits.sources, quantity)
+        assert text.startswith("guess: the URDF for joint_2; ")
+        assert text.endswith(" for joint_1, joint_3")
+    assert limits.sources.jerk == "guess: 100/s times the acceleration limits"
+    sources = limit_sources(problem, load_robot(problem))
+    assert {each.basis for each in sources.values()} == {"guess"}
     assert limits.position[1] == Range(-2, 2)
     assert np.allclose(
         [limits.position[0].low, limits.position[0].high], [-np.pi, np.pi]

@@ -16,6 +16,7 @@ from cnpgen.errors import RecipeError, UsageError
 from cnpgen.problems.load_robot import load_robot
 from cnpgen.problems.problem_file import load_problem
 from cnpgen.robots.robot import Robot
+from cnpgen.robots.robot_spec import LimitSources
 from cnpgen.robots.urdf import urdf_tree
 from cnpgen.robots.urdf_changes import SRDF_NAMES
 from cnpgen.robots.urdf_elements import _KNOWN, check_elements, unread_elements
@@ -310,6 +311,13 @@ def test_limits_of_moveit_replace_those_of_the_urdf(tmp_path: Path) -> None:
     assert robot.acceleration_limit[0] == 3.0
     assert robot.acceleration_limit[1] == usual.acceleration_limit[1]
     assert robot.jerk_limit.tolist() == [300.0, 44.0]
+    assert made.problem.limits.sources == LimitSources(
+        position="stated: limits.yaml for j1; the URDF for j2",
+        velocity="stated: limits.yaml for j1; the URDF for j2",
+        acceleration="guess: limits.yaml for j1;"
+        " 10/s times the velocity limits, at most 20 rad/s^2 for j2",
+        jerk="guess: limits.yaml for j2; 100/s times the acceleration limits for j1",
+    )
     notes = "\n".join(arm_notes(arm))
     assert "j2: max_velocity is not used, since has_velocity_limits is not" in notes
     assert "limits.yaml: default_velocity_scaling_factor is not used" in notes

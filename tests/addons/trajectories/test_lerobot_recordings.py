@@ -24,6 +24,8 @@ pytest.importorskip("lerobot")
 
 pytestmark = pytest.mark.slow
 
+MAX_START_S = 120  # of a process that simulates an arm
+
 
 def record(folder: Path, episodes: list[tuple[np.ndarray, np.ndarray]]) -> Path:
     """Write states and actions [rad] by LeRobot's own library."""
@@ -135,9 +137,13 @@ def recorded(seed: int, seconds: float) -> tuple[np.ndarray, np.ndarray]:
     workers += [context.Process(target=busy, args=(done,)) for _ in range(2)]
     for worker in workers:
         worker.start()
-    time.sleep(3.0)
     states, actions = [], []
     try:
+        # Under load a process takes seconds to start: until then the arm is frozen.
+        ready = time.perf_counter() + MAX_START_S
+        while not any(target[:]):
+            assert time.perf_counter() < ready
+            time.sleep(0.1)
         while len(states) < seconds * FPS:
             start = time.perf_counter()
             states.append(position[:])

@@ -1,0 +1,80 @@
+"""Who states the limits of an arm: its URDF, a joint_limits.yaml, or nobody."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from cnpgen.addons.init.arm import (
+    DEFAULT_RANGE_M,
+    DEFAULT_RANGE_RAD,
+    DEFAULT_SPEED,
+    Arm,
+)
+from cnpgen.addons.init.joint_limits import StatedJointLimits
+from cnpgen.robots.robot_spec import LimitSources, LimitSpec
+
+# Random states that determine placeholders of missing torque limits.
+TORQUE_STATES = 1000
+# Jerk limits per acceleration limit [1/s]; Franka Research 3: 500 ('cnpgen docs
+# references').
+INITIAL_JERK_RATE = 100.0
+PLACEHOLDERS = {  # limit -> what is put in where the URDF has none
+    "position": f"{DEFAULT_RANGE_RAD:.3g} rad, or {DEFAULT_RANGE_M:g} m, to either side",
+    "velocity": f"{DEFAULT_SPEED:g} rad/s or m/s",
+    "torque": f"the largest of {TORQUE_STATES:,} random states, at speeds and accelerations within the limits",
+}
+
+
+def stated_sources(
+    arm: Arm, limits: LimitSpec, joint_limits: StatedJointLimits | None
+) -> LimitSources:
+    """Return the sources of an arm's limits; empty where the origin of the numbers says it.
+
+    A limit with a placeholder of any joint is a guess.
+    """
+    file = "" if joint_limits is None else joint_limits.path.name
+    names = [joint.name for joint in arm.planned]
+    sources = {}
+    for limit, instead in PLACEHOLDERS.items():
+        guessed = [each.name for each in arm.planned if limit in each.missing]
+        stated = [each.name for each in arm.planned if limit in each.replaced]
+        # A torque that cannot hold the arm is replaced, whoever states it.
+        stated = [name for name in stated if name not in guessed]
+        others = [each for each in names if each not in {*guessed, *stated}]
+        sources[limit] = _source(
+            (file, stated),
+            ("the URDF", others if guessed or stated else []),
+            (instead, guessed),
+        )
+    rate, cap = limits.acceleration_rate, limits.acceleration_cap
+    rules = {
+        "acceleration": f"{rate:g}/s times the velocity limits, at most {cap:g} rad/s^2",
+        "jerk": f"{INITIAL_JERK_RATE:g}/s times the acceleration limits",
+    }
+    for limit, rule in rules.items():
+        of_file = {} if joint_limits is None else joint_limits.of(f"max_{limit}")
+        stated = [name for name in names if name in of_file]
+        others = [name for name in names if name not in of_file]
+        if getattr(limits, limit) is not None:
+            sources[limit] = _source((file, stated), ("", []), (rule, others))
+    return LimitSources(**sources)
+
+
+def _source(
+    stated: tuple[str, Sequence[str]],
+    urdf: tuple[str, Sequence[str]],
+    guessed: tuple[str, Sequence[str]],
+) -> str:
+    """Return a text of sources and their joints; its basis is that of the weakest source.
+
+    Empty without joints.
+    """
+    found = [(text, joints) for text, joints in (stated, urdf, guessed) if joints]
+    if not found:
+        return ""
+    basis = "guess" if guessed[1] else "stated"
+    # One source is that of all joints.
+    if len(found) == 1:
+        return f"{basis}: {found[0][0]}"
+    parts = (f"{text} for {', '.join(joints)}" for text, joints in found)
+    return f"{basis}: {'; '.join(parts)}"

@@ -1,0 +1,143 @@
+"""Who states the limits of a problem: the vendor, the URDF, another source, or nobody."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass
+
+from cnpgen.problems.constraints.joint import (
+    JointAcceleration,
+    JointJerk,
+    JointPosition,
+    JointTorque,
+    JointVelocity,
+)
+from cnpgen.problems.load_robot import JERK_RATE
+from cnpgen.problems.problem import Problem
+from cnpgen.robots.robot import Robot
+from cnpgen.robots.robot_spec import LimitSources
+from cnpgen.robots.urdf import urdf_tree
+from cnpgen.robots.urdf_parameters import urdf_parameters
+
+NOT_STATED = "not stated"
+WORDS = {  # basis -> what a limit is called
+    "vendor": "the vendor's",
+    "urdf": "the URDF's",
+    "stated": "of another source",
+    "guess": "guessed",
+    NOT_STATED: NOT_STATED,
+}
+# Quantity -> constraint that its limit is for, in the order of output.
+_JUDGED_BY = {
+    "position": JointPosition,
+    "velocity": JointVelocity,
+    "acceleration": JointAcceleration,
+    "jerk": JointJerk,
+    "torque": JointTorque,
+    "motor": JointTorque,
+}
+
+
+@dataclass(frozen=True)
+class LimitSource:
+    """Source of a limit.
+
+    Attributes:
+        basis: "vendor", "urdf", "stated" (by another source), "guess" or "not stated".
+        source: Document or rule; may be empty.
+    """
+
+    basis: str
+    source: str = ""
+
+    def to_dict(self) -> dict[str, str]:
+        """Return the source for JSON."""
+        return {"basis": self.basis, "source": self.source}
+
+
+def limit_sources(problem: Problem, robot: Robot) -> dict[str, LimitSource]:
+    """Return the source of each limit: quantity -> source.
+
+    "motor" is present if [drive] limits motors.
+    """
+    limits, drive = problem.limits, problem.drive
+    stated = limits.sources or LimitSources()
+    urdf, numbers = LimitSource("urdf"), LimitSource(NOT_STATED)
+    # Without a stated source, the origin of the numbers decides.
+    origins: dict[str, Callable[[], LimitSource]] = {
+        "position": lambda: numbers if limits.position else urdf,
+        "velocity": lambda: numbers if limits.velocity else urdf,
+        "acceleration": lambda: (
+            numbers if limits.acceleration else _accelerations(problem, robot)
+        ),
+        "jerk": lambda: numbers if limits.jerk else _jerks(robot),
+        "torque": lambda: numbers if limits.torque else urdf,
+    }
+    if drive.torque or drive.line or drive.power:
+        origins["motor"] = lambda: numbers
+    scales = {
+        "position": limits.position_scale,
+        "velocity": limits.velocity_scale,
+        "torque": limits.torque_scale,
+        "motor": limits.torque_scale,
+    }
+    found = {}
+    for name, origin in origins.items():
+        text = getattr(stated, name)
+        source = LimitSource(*text.split(": ", 1)) if text else origin()
+        scale = scales.get(name, 1.0)
+        found[name] = source if scale == 1 else _scaled(source, scale)
+    return found
+
+
+def judged_sources(problem: Problem, robot: Robot) -> dict[str, LimitSource]:
+    """Return the sources of the limits that constraints of a problem apply: quantity -> source."""
+    kinds = {type(constraint) for constraint in problem.constraint}
+    return {
+        name: source
+        for name, source in limit_sources(problem, robot).items()
+        if _JUDGED_BY[name] in kinds
+    }
+
+
+def sources_line(sources: Mapping[str, LimitSource]) -> str:
+    """Return sources in one line, "limits: the URDF's: position; guessed: jerk"; empty without any."""
+    texts = [
+        f"{words}: {', '.join(_names(sources, basis))}"
+        for basis, words in WORDS.items()
+        if _names(sources, basis)
+    ]
+    return f"limits: {'; '.join(texts)}" if texts else ""
+
+
+def _names(sources: Mapping[str, LimitSource], basis: str) -> list[str]:
+    return [name for name, source in sources.items() if source.basis == basis]
+
+
+def _scaled(source: LimitSource, scale: float) -> LimitSource:
+    """Return the source of a fraction of a limit."""
+    parts: Iterable[str] = filter(None, (source.source, f"times {scale:g}"))
+    return LimitSource(source.basis, ", ".join(parts))
+
+
+def _accelerations(problem: Problem, robot: Robot) -> LimitSource:
+    """Return the source of limits by the rule of rate and cap, which a URDF 1.2 may narrow."""
+    limits = problem.limits
+    if _rates(robot, "acceleration") == robot.acceleration_limit.tolist():
+        return LimitSource("urdf")
+    rule = f"{limits.acceleration_rate:g}/s times the velocity limits"
+    return LimitSource("guess", f"{rule}, at most {limits.acceleration_cap:g} rad/s^2")
+
+
+def _jerks(robot: Robot) -> LimitSource:
+    """Return the source of limits in proportion to accelerations, which a URDF 1.2 may narrow."""
+    if _rates(robot, "jerk") == robot.jerk_limit.tolist():
+        return LimitSource("urdf")
+    return LimitSource("guess", f"{JERK_RATE:g}/s times the acceleration limits")
+
+
+def _rates(robot: Robot, name: str) -> list[float | None]:
+    """Return the limits of accelerations or jerks of a URDF 1.2, one per joint; None where it has none."""
+    joints = urdf_parameters(urdf_tree(robot.urdf_text)).joints.values()
+    rates = {joint.name: joint.rates.get(name) for joint in joints}
+    return [rates[joint] for joint in robot.joint_names]
