@@ -219,7 +219,7 @@ def _explain(
 ) -> tuple[Sequence[str], int]:
     """Return the lines that describe an error, and the exit code."""
     if isinstance(error, RecipeError):
-        return error.errors, error.exit_code
+        return str(error).splitlines(), error.exit_code
     if isinstance(error, CnpgenError):
         return [" ".join(error.text(shell_spelling(options)).split())], error.exit_code
     code = MachineError.exit_code

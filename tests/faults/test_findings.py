@@ -10,7 +10,13 @@ import pytest
 
 from cnpgen.addons.benchmark.results_file import open_results
 from cnpgen.addons.online.moving_pucks import PuckModel
-from cnpgen.errors import MAX_ERROR_LINES, MAX_LINE_LENGTH, DatasetError, RecipeError, UsageError
+from cnpgen.errors import (
+    MAX_ERROR_LINES,
+    MAX_LINE_LENGTH,
+    DatasetError,
+    RecipeError,
+    UsageError,
+)
 from cnpgen.plans import PlanStatus, load_plans, save_plans
 from cnpgen.plans.evaluate import evaluate_plans
 from cnpgen.plans.plans import screen
