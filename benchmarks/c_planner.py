@@ -10,12 +10,19 @@ their relative spread over the inputs is (p99 - p1) / median.
     python benchmarks/c_planner.py
     python benchmarks/c_planner.py --model airhockey-hit --calls 1000000 --repeat 5
     python benchmarks/c_planner.py --model airhockey-online --options "-O2"
+    python benchmarks/c_planner.py --earlier ../earlier-cnpgen
+
+``--earlier`` compares with the ``Planner.plan`` of another source tree too: the tree's
+package plans the same problems in a process of its own in the same run, each time right
+before that of this package.
 """
 
 import argparse
+import os
 import shlex
 import shutil
 import subprocess
+import sys
 import tempfile
 from functools import partial
 from pathlib import Path
@@ -73,6 +80,25 @@ int main(int count, char **arguments) {
 }
 """
 
+# Print the CPU time per plan [s] of the package that PYTHONPATH selects.
+ONE_BY_ONE = r"""
+import sys, time
+import numpy as np
+from cnpgen.machine.threads import one_thread
+from cnpgen.planner.planner import Planner
+with np.load(sys.argv[2]) as file:
+    columns = dict(file)
+planner = Planner(sys.argv[1])
+rows = [dict(zip(columns, values)) for values in zip(*columns.values())]
+with one_thread():
+    for row in rows[:20]:
+        planner.plan(**row)
+    began = time.process_time()
+    for row in rows:
+        planner.plan(**row)
+    print((time.process_time() - began) / len(rows))
+"""
+
 
 def add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
@@ -80,6 +106,9 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--calls", type=int, default=20_000, help="calls in C")
     parser.add_argument("--repeat", type=int, default=5, help="repetitions")
+    parser.add_argument(
+        "--earlier", type=Path, help="source tree whose Planner.plan is timed as well"
+    )
     parser.add_argument(
         "--options", default=OPTIONS, help=f"of the compiler (default: {OPTIONS})"
     )
@@ -109,10 +138,23 @@ def build(sources: list[str], folder: Path, options: str) -> Path:
     return folder / "time"
 
 
-def one_by_one(planner: Planner, boundary: Boundary, rows: range) -> None:
+def one_by_one(planner: Planner, rows: list[dict[str, Any]]) -> None:
     for row in rows:
-        conditions = {name: values[row] for name, values in boundary.arrays().items()}
-        planner.plan(**conditions)
+        planner.plan(**row)
+
+
+def time_of_tree(tree: Path, model: str, boundary: Boundary, folder: Path) -> float:
+    """Return the CPU time per plan of another source tree's ``Planner.plan`` [s].
+
+    The model is the shipped one of the tree.
+    """
+    np.savez(folder / "rows.npz", **boundary.arrays())  # type: ignore[arg-type]
+    out = subprocess.run(
+        [sys.executable, "-c", ONE_BY_ONE, model, str(folder / "rows.npz")],
+        env=os.environ | {"PYTHONPATH": str(tree.resolve())},
+        cwd=folder, capture_output=True, text=True, check=True,
+    )  # fmt: skip
+    return float(out.stdout)
 
 
 def spread_of_instructions(program: Path) -> tuple[float | None, float | None]:
@@ -136,6 +178,13 @@ def spread_of_instructions(program: Path) -> tuple[float | None, float | None]:
     return float(np.median(own)), float((high - low) / np.median(own))
 
 
+def ratio_of(times: list[float], others: list[float]) -> float | None:
+    """Return the median ratio of the times of each repetition; None without times."""
+    if not times or not others:
+        return None
+    return median(a / b for a, b in zip(times, others, strict=True))
+
+
 @one_thread()
 def measure(model: str, folder: Path, given: argparse.Namespace) -> dict[str, Any]:
     planner = Planner(model)
@@ -144,11 +193,17 @@ def measure(model: str, folder: Path, given: argparse.Namespace) -> dict[str, An
     boundary = planner._checked(boundary)
     sources = write_sources(model, folder, boundary)
     program = build(sources, folder, given.options)
-    python, c, block = [], [], []
-    one_by_one(planner, boundary, range(20))
+    python, earlier, c, block = [], [], [], []
+    columns = boundary.arrays()
+    rows = [
+        dict(zip(columns, row, strict=True))
+        for row in zip(*columns.values(), strict=True)
+    ]
     for _ in range(given.repeat):
-        rows = range(PROBLEMS)
-        python.append(cpu_of(partial(one_by_one, planner, boundary, rows)) / PROBLEMS)
+        if given.earlier is not None:
+            earlier.append(time_of_tree(given.earlier, model, boundary, folder))
+        one_by_one(planner, rows[:20])
+        python.append(cpu_of(partial(one_by_one, planner, rows)) / PROBLEMS)
         lines = subprocess.run(
             [str(program), str(given.calls // given.repeat)],
             cwd=folder, capture_output=True, text=True, check=True,
@@ -156,10 +211,11 @@ def measure(model: str, folder: Path, given: argparse.Namespace) -> dict[str, An
         block.append(float(lines[0]) * 1e-6)
         c.append(np.array(lines[1:], float) * 1e-6)
     every = np.concatenate(c)
-    ratio = median(p / own for p, own in zip(python, block, strict=True))
     result = {
         "model": model,
-        "Python / C": ratio,
+        "Python / C": ratio_of(python, block),
+        "earlier / C": ratio_of(earlier, block),
+        "Python / earlier": ratio_of(python, earlier),
         "p99 / median": float(np.quantile(every, 0.99) / np.median(every)),
         "p99.99 / median": float(np.quantile(every, 0.9999) / np.median(every)),
         "instructions": None,
@@ -190,7 +246,8 @@ def show(results: list[dict[str, Any]]) -> list[list[str]]:
     rows = [list(results[0])]
     for result in results:
         count, spread = result["instructions"], result["spread"]
-        numbers = [f"{result[name]:.1f}" for name in list(result)[1:4]]
+        ratios = [result[name] for name in list(result)[1:6]]
+        numbers = ["-" if ratio is None else f"{ratio:.2f}" for ratio in ratios]
         counted = ["-", "-"] if count is None else [f"{count:,.0f}", f"{spread:.1%}"]
         rows.append([result["model"], *numbers, *counted])
     return rows

@@ -21,6 +21,7 @@ from tests.addons.deploy.compiled_planner import (
     needs_compiler,
 )
 from tests.addons.deploy.test_export_planner import (
+    MANY_ROWS,
     NO_RATE,
     NOT_FINITE,
     PARAMETER,
@@ -83,6 +84,26 @@ def test_plans_of_a_model_equal_those_of_python(model: str, tmp_path: Path):
     accepted = evaluate_plans(plans[np.flatnonzero(valid)]).valid
     assert accepted.mean() > 0.97  # the check sees a grid only
     assert len(requests) == ROWS
+
+
+@pytest.mark.extended
+@pytest.mark.parametrize(
+    "model",
+    ["airhockey-tables", "airhockey-replan", "heavy-object", "heavy-object-loads"],
+)
+def test_many_plans_of_a_model_equal_those_of_python(model: str, tmp_path: Path):
+    planner = Planner(model)
+    drawn = draw_boundary_problems(model, MANY_ROWS, seed=11).boundary
+    boundary = planner._checked(drawn)
+    planned = compiled_planner(model, tmp_path, "-O2").plan(requests_of(boundary))
+    plans, valid = planner.plan_batch(boundary), planned.code == VALID
+    assert valid.mean() > 0.9
+    np.testing.assert_allclose(
+        planned.path[valid], plans.path_control_points[valid], rtol=0, atol=1e-6
+    )
+    np.testing.assert_allclose(
+        planned.rate[valid], plans.rate_control_points[valid], rtol=1e-5
+    )
 
 
 def test_time_parametrized_plans_have_equal_verdicts(tmp_path: Path):

@@ -26,16 +26,24 @@ bound within a step of `up`: |change| <= up (|linear| + up |square|). */
 static int quadratics(NAME_memory *memory, int k, double up) {
   const double *r = memory->column + ORDERS * JOINTS * PHASES + k, *r1 = memory->column + (ORDERS * JOINTS + 1) * PHASES + k;
   const double *b = memory->direction[0] + k, *b1 = memory->direction[1] + k;
-  double worst[LANES];
-  for (int l = 0; l < LANES; l++) worst[l] = -1;
+  double worst[LANES], rr[LANES], rr1[LANES], rb[LANES], rb1[LANES], bb[LANES], bb1[LANES];
+  for (int l = 0; l < LANES; l++) { /* products that all rows share */
+    worst[l] = -1;
+    rr[l] = r[l] * r[l];
+    rr1[l] = r[l] * r1[l];
+    rb[l] = 2 * r[l] * b[l];
+    rb1[l] = r[l] * b1[l] + r1[l] * b[l];
+    bb[l] = b[l] * b[l];
+    bb1[l] = b[l] * b1[l];
+  }
   for (int row = 0; row < ROWS; row++) {
     const double *constant = memory->coefficients + row * PHASES + k, *square = constant + ROWS * PHASES;
     const double *mixed = square + ROWS * PHASES;
     double *g = memory->quadratic[row][0], *linear = memory->quadratic[row][1], *power = memory->quadratic[row][2];
     for (int l = 0; l < LANES; l++) {
-      g[l] = constant[l] + square[l] * (r[l] * r[l]) + mixed[l] * (r[l] * r1[l]);
-      linear[l] = square[l] * (2 * r[l] * b[l]) + mixed[l] * (r[l] * b1[l] + r1[l] * b[l]);
-      power[l] = square[l] * (b[l] * b[l]) + mixed[l] * (b[l] * b1[l]);
+      g[l] = constant[l] + square[l] * rr[l] + mixed[l] * rr1[l];
+      linear[l] = square[l] * rb[l] + mixed[l] * rb1[l];
+      power[l] = square[l] * bb[l] + mixed[l] * bb1[l];
       double above = g[l] - upper_bound[row], below = lower_bound[row] - g[l];
       double excess = (above > below ? above : below) + up * (fabs(linear[l]) + up * fabs(power[l]));
       worst[l] = excess > worst[l] ? excess : worst[l];
