@@ -195,8 +195,11 @@ def boundary_of(  # noqa: PLR0917 - in the order of the paper
     are zero, at the goal's acceleration free.
 
     Raises:
-        UsageError: A shape is wrong, or a value is not finite.
+        UsageError: A position is None, a shape is wrong, or a value is not finite.
     """
+    for name, position in (("start_q", start_q), ("goal_q", goal_q)):
+        if position is None:
+            raise UsageError("must be joint positions, got None", argument=name)
     conditions = start_q, start_dq, start_ddq, goal_q, goal_dq, goal_ddq
     if parameters is None and (one := _one_motion(n, conditions)) is not None:
         return one

@@ -12,6 +12,7 @@ from cnpgen.trajectory.boundary import (
     Boundary,
     anchor_line,
     assemble,
+    boundary_of,
     goal_points,
     start_points,
 )
@@ -185,3 +186,13 @@ def test_conditions_of_different_joints_raise_an_error_with_their_names() -> Non
             match=f"same number of joints, got: start_q {JOINTS}, .*goal_q {JOINTS + 1}",
         ):
             points(mixed, rate, spec)
+
+
+@pytest.mark.parametrize("name", ["start_q", "goal_q"])
+def test_missing_positions_are_refused_and_not_taken_as_zero(name: str) -> None:
+    positions = {"start_q": np.zeros(6), "goal_q": np.zeros(6), name: None}
+    with pytest.raises(UsageError) as caught:
+        boundary_of(
+            6, positions["start_q"], None, None, positions["goal_q"], None, None
+        )
+    assert caught.value.argument == name

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from cnpgen.addons.trajectories.lerobot_tables import LEROBOT_INFO
+from cnpgen.addons.trajectories.lerobot_tables import LEROBOT_INFO, feature_names
 from cnpgen.addons.trajectories.parquet_tables import read_parquet
 from cnpgen.addons.trajectories.table_units import plain, stated_factor
 from cnpgen.addons.trajectories.trajectory_tables import read_trajectory_tables
@@ -114,8 +114,8 @@ def _read_lerobot(folder: Path) -> Recording:
         info = parse_json(content.decode())
         version = str(info["codebase_version"])
         features = info["features"]
-        names = _feature_names(features[STATE])
-        width = len(_feature_names(features.get(ACTION, {"shape": [len(names)]})))
+        names = tuple(feature_names(features[STATE], "{}"))
+        width = len(feature_names(features.get(ACTION, {"shape": [len(names)]})))
         robot = str(info.get("robot_type") or "")
     except (ValueError, KeyError, TypeError, IndexError) as error:
         text = (
@@ -166,20 +166,6 @@ def _stated_lengths(folder: Path) -> dict[int, int]:
             )
             found |= dict(zip(*columns, strict=True))
     return found
-
-
-def _feature_names(feature: Any) -> tuple[str, ...]:
-    """Return the names of a feature's values: a list, a list in an object, or indices."""
-    (width,) = map(int, feature["shape"])
-    names = feature.get("names")
-    if isinstance(names, dict):
-        # Of one kind, such as {"motors": [...]}.
-        (names,) = names.values()
-    if names is None:
-        names = list(range(width))
-    if not isinstance(names, list) or len(names) != width:
-        raise ValueError(f"a feature of {width} values has the names {names!r:.60}")
-    return tuple(map(str, names))
 
 
 def _column(table: Any, name: str, file: Path, width: int) -> Array:

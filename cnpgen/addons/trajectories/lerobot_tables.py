@@ -99,9 +99,9 @@ def _described_dataset(
         features = info["features"]
         version = str(info["codebase_version"])
         key = next(key for key in ("observation.state", "action") if key in features)
-        names = _feature_names(features[key])
+        names = feature_names(features[key])
         described = (
-            _feature_names(features[LEROBOT_ENVIRONMENT])
+            feature_names(features[LEROBOT_ENVIRONMENT])
             if LEROBOT_ENVIRONMENT in features
             else []
         )
@@ -132,9 +132,13 @@ def _number_columns(table: Any, path: Path, widths: Mapping[str, int]) -> list[V
 
 
 def _unknown_keys(
-    described: Mapping[str, Any], known: Sequence[str], of: str, folder: Path
+    described: Any, known: Sequence[str], of: str, folder: Path
 ) -> list[str]:
     """Return the keys that are not read; UsageError for one that is near a missing key."""
+    if not isinstance(described, dict):
+        raise UsageError(
+            f"{folder}: {of} must be an object with keys, got {described!r:.60}"
+        )
     missing = [key for key in known if key not in described]
     unknown = [key for key in described if key not in known]
     for key in unknown:
@@ -153,23 +157,27 @@ def _check_rate(place: str, t: Values, rate: Any) -> None:
         raise UsageError(f"{place} has steps of {step:.3g} s, and its fps is {rate:g}")
 
 
-def _feature_names(feature: Any) -> list[str]:
+def feature_names(feature: Any, unnamed: str = "q{}") -> list[str]:
     """Return the names of a feature's values: a list, a list in an object, or indices.
+
+    Args:
+        feature: The description of a feature, in info.json.
+        unnamed: Form of the names of values without a name.
 
     Raises:
         TypeError, KeyError, ValueError, IndexError: It is no feature.
     """
-    (width,) = map(int, feature["shape"])
+    (width,) = feature["shape"]
     names = feature.get("names")
-    if not 0 < width <= MAX_FEATURE_WIDTH:
+    if not isinstance(width, int) or not 0 < width <= MAX_FEATURE_WIDTH:
         raise ValueError(
-            f"a feature has {width} values, expected 1 to {MAX_FEATURE_WIDTH:,}"
+            f"a feature has {width!r:.60} values, expected 1 to {MAX_FEATURE_WIDTH:,}"
         )
     if isinstance(names, dict):
         # Of one kind, such as {"motors": [...]}.
         (names,) = names.values()
     if names is None:
-        return [f"q{k}" for k in range(width)]
+        return [unnamed.format(k) for k in range(width)]
     if not isinstance(names, list) or len(names) != width:
         raise ValueError(f"a feature of {width} values has the names {names!r:.60}")
     return [str(name) for name in names]

@@ -62,6 +62,15 @@ def load(
         ),
         (lambda i: i.update(units="deg"), "attribute units of info.json"),
         (
+            lambda i: i["features"].update(timestamp=0.5),
+            "timestamp must be an object with keys, got 0.5",
+        ),
+        (
+            lambda i: i["features"][STATE].update(shape=[1e999]),
+            "a feature has inf values",
+        ),
+        (lambda i: i["features"][STATE].update(shape=[10**12]), "a feature has 10"),
+        (
             lambda i: i["features"][STATE].update(unit="deg"),
             f"attribute unit of {STATE}",
         ),
