@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 import cnpgen
+from cnpgen.addons.trajectories.fit import fit_motion
 from cnpgen.errors import RecipeError, UsageError
 from cnpgen.losses.metric import Metric
 from cnpgen.problems.obstacles import with_capacity
@@ -20,7 +21,6 @@ from cnpgen.problems.problem_record import (
 )
 from cnpgen.problems.scenes.scene_problem import make_mesh
 from cnpgen.schema.arguments import check_range, distinct
-from cnpgen.trajectory.fit import fit_motion
 from cnpgen.trajectory.spline_motion import Motion
 from cnpgen.trajectory.trajectory_spec import TrajectorySpec
 
