@@ -202,6 +202,8 @@ def change_urdf(text: str, draw: Random) -> str:
     tree = ElementTree.fromstring(text)
     for _ in range(draw.choice((1, 1, 2, 5))):
         parents = [element for element in tree.iter() if len(element)]
+        if not parents:  # an earlier change removed the last element
+            break
         parent = draw.choice(parents)
         element = draw.choice(list(parent))
         how = draw.randrange(6)

@@ -99,3 +99,9 @@ def test_changed_meshes_and_srdf_files_reach_their_readers(
     assert calls["with_disabled_pairs"] == meshes.read["mesh"] + 30
     assert min(meshes.refused["mesh"], pairs.read["srdf"], pairs.refused["srdf"]) > 0
     assert meshes.findings + pairs.findings == []
+
+
+def test_a_robot_of_which_every_element_is_removed_can_be_changed_further():
+    robot = "<robot><link/></robot>"
+    texts = [mutations.change_urdf(robot, Random(seed)) for seed in range(100)]
+    assert any("link" not in text for text in texts)
