@@ -1,4 +1,4 @@
-"""Who states the limits of a problem: the vendor, the URDF, another source, or nobody."""
+"""Who states the limits of a problem: the vendor, the URDF, another source, or no source."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from cnpgen.problems.constraints.joint import (
 from cnpgen.problems.load_robot import JERK_RATE
 from cnpgen.problems.problem import Problem
 from cnpgen.robots.robot import Robot
-from cnpgen.robots.robot_spec import LimitSources
+from cnpgen.robots.robot_spec import LimitSources, LimitSpec
 from cnpgen.robots.urdf import urdf_tree
 from cnpgen.robots.urdf_parameters import urdf_parameters
 
@@ -110,6 +110,17 @@ def sources_line(sources: Mapping[str, LimitSource]) -> str:
     return f"limits: {'; '.join(texts)}" if texts else ""
 
 
+def acceleration_rule(limits: LimitSpec) -> str:
+    """Describe acceleration limits of a rate and a cap."""
+    rate = f"{limits.acceleration_rate:g}/s times the velocity limits"
+    return f"{rate}, at most {limits.acceleration_cap:g} rad/s^2"
+
+
+def jerk_rule(rate: float) -> str:
+    """Describe jerk limits in proportion to acceleration limits [1/s]."""
+    return f"{rate:g}/s times the acceleration limits"
+
+
 def _names(sources: Mapping[str, LimitSource], basis: str) -> list[str]:
     return [name for name, source in sources.items() if source.basis == basis]
 
@@ -122,18 +133,16 @@ def _scaled(source: LimitSource, scale: float) -> LimitSource:
 
 def _accelerations(problem: Problem, robot: Robot) -> LimitSource:
     """Return the source of limits by the rule of rate and cap, which a URDF 1.2 may narrow."""
-    limits = problem.limits
     if _rates(robot, "acceleration") == robot.acceleration_limit.tolist():
         return LimitSource("urdf")
-    rule = f"{limits.acceleration_rate:g}/s times the velocity limits"
-    return LimitSource("guess", f"{rule}, at most {limits.acceleration_cap:g} rad/s^2")
+    return LimitSource("guess", acceleration_rule(problem.limits))
 
 
 def _jerks(robot: Robot) -> LimitSource:
     """Return the source of limits in proportion to accelerations, which a URDF 1.2 may narrow."""
     if _rates(robot, "jerk") == robot.jerk_limit.tolist():
         return LimitSource("urdf")
-    return LimitSource("guess", f"{JERK_RATE:g}/s times the acceleration limits")
+    return LimitSource("guess", jerk_rule(JERK_RATE))
 
 
 def _rates(robot: Robot, name: str) -> list[float | None]:

@@ -1,4 +1,4 @@
-"""Who states the limits of an arm: its URDF, a joint_limits.yaml, or nobody."""
+"""Who states the limits of an arm: its URDF, a joint_limits.yaml, or no source."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ from cnpgen.addons.init.arm import (
     Arm,
 )
 from cnpgen.addons.init.joint_limits import StatedJointLimits
+from cnpgen.problems.limit_sources import acceleration_rule, jerk_rule
 from cnpgen.robots.robot_spec import LimitSources, LimitSpec
 
 # Random states that determine placeholders of missing torque limits.
@@ -38,7 +39,7 @@ def stated_sources(
     for limit, instead in PLACEHOLDERS.items():
         guessed = [each.name for each in arm.planned if limit in each.missing]
         stated = [each.name for each in arm.planned if limit in each.replaced]
-        # A torque that cannot hold the arm is replaced, whoever states it.
+        # A torque that cannot hold the arm is replaced, of any source.
         stated = [name for name in stated if name not in guessed]
         others = [each for each in names if each not in {*guessed, *stated}]
         sources[limit] = _source(
@@ -46,10 +47,9 @@ def stated_sources(
             ("the URDF", others if guessed or stated else []),
             (instead, guessed),
         )
-    rate, cap = limits.acceleration_rate, limits.acceleration_cap
     rules = {
-        "acceleration": f"{rate:g}/s times the velocity limits, at most {cap:g} rad/s^2",
-        "jerk": f"{INITIAL_JERK_RATE:g}/s times the acceleration limits",
+        "acceleration": acceleration_rule(limits),
+        "jerk": jerk_rule(INITIAL_JERK_RATE),
     }
     for limit, rule in rules.items():
         of_file = {} if joint_limits is None else joint_limits.of(f"max_{limit}")
