@@ -35,6 +35,16 @@ ROWS = 300
 MANY_ROWS = 10_000
 
 
+def assert_equal_motions(planned: Planned, plans: Plans, chosen: np.ndarray) -> None:
+    """Compare the control points of paths [rad] and the relative ones of rates, of some plans."""
+    np.testing.assert_allclose(
+        planned.path[chosen], plans.path_control_points[chosen], rtol=0, atol=1e-6
+    )
+    np.testing.assert_allclose(
+        planned.rate[chosen], plans.rate_control_points[chosen], rtol=1e-5
+    )
+
+
 def requests_of(boundary: Boundary) -> np.ndarray:
     """Return the numbers of requests: conditions, then parameters."""
     columns = list(boundary.conditions().values())
@@ -71,12 +81,7 @@ def planned(compiled, boundary) -> Planned:
 def test_plans_equal_those_of_python(planned, plans):
     valid = planned.code == VALID
     assert valid.mean() > 0.95
-    np.testing.assert_allclose(
-        planned.path[valid], plans.path_control_points[valid], rtol=0, atol=1e-6
-    )
-    np.testing.assert_allclose(
-        planned.rate[valid], plans.rate_control_points[valid], rtol=1e-5
-    )
+    assert_equal_motions(planned, plans, valid)
     np.testing.assert_allclose(
         planned.duration[valid], plans.duration[valid], rtol=1e-5
     )
@@ -91,12 +96,7 @@ def test_plans_of_many_rows_equal_those_of_python(hits, tmp_path: Path, options:
     )
     plans, valid = hits.plan_batch(boundary), planned.code == VALID
     assert valid.mean() > 0.95
-    np.testing.assert_allclose(
-        planned.path[valid], plans.path_control_points[valid], rtol=0, atol=1e-6
-    )
-    np.testing.assert_allclose(
-        planned.rate[valid], plans.rate_control_points[valid], rtol=1e-5
-    )
+    assert_equal_motions(planned, plans, valid)
 
 
 def test_the_duration_is_that_of_its_own_rates(planned, plans):

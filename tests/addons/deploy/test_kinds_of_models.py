@@ -26,6 +26,7 @@ from tests.addons.deploy.test_export_planner import (
     NOT_FINITE,
     PARAMETER,
     VALID,
+    assert_equal_motions,
     requests_of,
 )
 from tests.conftest import some
@@ -72,12 +73,7 @@ def test_plans_of_a_model_equal_those_of_python(model: str, tmp_path: Path):
     plans = planner.plan_batch(boundary)
     valid = planned.code == VALID
     assert valid.mean() > 0.85
-    np.testing.assert_allclose(
-        planned.path[valid], plans.path_control_points[valid], rtol=0, atol=1e-6
-    )
-    np.testing.assert_allclose(
-        planned.rate[valid], plans.rate_control_points[valid], rtol=1e-5
-    )
+    assert_equal_motions(planned, plans, valid)
     np.testing.assert_allclose(
         planned.duration[valid], plans.duration[valid], rtol=1e-5
     )
@@ -98,12 +94,7 @@ def test_many_plans_of_a_model_equal_those_of_python(model: str, tmp_path: Path)
     planned = compiled_planner(model, tmp_path, "-O2").plan(requests_of(boundary))
     plans, valid = planner.plan_batch(boundary), planned.code == VALID
     assert valid.mean() > 0.9
-    np.testing.assert_allclose(
-        planned.path[valid], plans.path_control_points[valid], rtol=0, atol=1e-6
-    )
-    np.testing.assert_allclose(
-        planned.rate[valid], plans.rate_control_points[valid], rtol=1e-5
-    )
+    assert_equal_motions(planned, plans, valid)
 
 
 def test_time_parametrized_plans_have_equal_verdicts(tmp_path: Path):
