@@ -246,7 +246,7 @@ def _one_motion(n: int, conditions: Sequence[ArrayLike | None]) -> Boundary | No
             return None
     # One array for all conditions needs one check.
     numbers_of_all = np.concatenate(parts)
-    if conditions[0] is None or not math.isfinite(np.add.reduce(numbers_of_all)):
+    if not math.isfinite(np.add.reduce(numbers_of_all)):
         return None
     rows = numbers_of_all.reshape(len(parts), 1, n)
     return unchecked(Boundary, *rows, *free, None)
