@@ -55,7 +55,7 @@ def scene_of(
     """
     # The object is upright and centered at the tip: half of its height is below.
     half = 0.0 if problem.object is None else problem.object.size[2] / 2
-    parts, constraint = [], problem.scene_constraint
+    parts = []
     if problem.obstacle:
         bottoms = {"start": start_xyz[:, 2] - half, "goal": goal_xyz[:, 2] - half}
         parts.append(place_obstacles(problem.obstacle, bottoms))
@@ -64,19 +64,10 @@ def scene_of(
         parameters = None
     elif parameters is None:
         parameters = np.tile(problem.nominal_parameters, (len(start_xyz), 1))
-    if constraint is not None:
-        if goal_velocity is None:
-            text = f"is missing: the problem {problem.name!r} needs it"
-            raise UsageError(text, argument="goal_velocity")
-        shapes = [xyz.shape for xyz in (start_xyz, goal_xyz, goal_velocity)]
-        if set(shapes) != {(len(start_xyz), 3)}:
-            text = f"positions and velocities must have one shape (N, 3), got {shapes}"
-            raise UsageError(text)
-        # The puck lies on the table, whose frame differs from sample to sample.
-        if (frame := table_frame_of(problem, parameters)) is not None:
-            goal_velocity = frame.along_table(goal_velocity)
-            goal_xyz = frame.to_table(goal_xyz)
-        parts.append(constraint.scene_values(goal_xyz, goal_velocity))
+    if problem.scene_constraint is not None:
+        parts.append(
+            _constraint_values(problem, start_xyz, goal_xyz, goal_velocity, parameters)
+        )
     if parameters is not None:
         parts.append(parameters)
     if len(parts) == 1:
@@ -86,6 +77,29 @@ def scene_of(
         poses = np.concatenate(parts, axis=1)
     scene = Scene(tuple(problem.obstacle), poses)
     return scene if obstacle_poses is None else scene.with_poses(obstacle_poses)
+
+
+def _constraint_values(
+    problem: Problem,
+    start_xyz: Array,
+    goal_xyz: Array,
+    goal_velocity: Array | None,
+    parameters: Array | None,
+) -> Array:
+    """Return the values that the scene's constraint depends on, such as a puck, shape (N, width)."""
+    assert problem.scene_constraint is not None
+    if goal_velocity is None:
+        text = f"is missing: the problem {problem.name!r} needs it"
+        raise UsageError(text, argument="goal_velocity")
+    shapes = [xyz.shape for xyz in (start_xyz, goal_xyz, goal_velocity)]
+    if set(shapes) != {(len(start_xyz), 3)}:
+        text = f"positions and velocities must have one shape (N, 3), got {shapes}"
+        raise UsageError(text)
+    # The puck lies on the table, whose frame differs from sample to sample.
+    if (frame := table_frame_of(problem, parameters)) is not None:
+        goal_velocity = frame.along_table(goal_velocity)
+        goal_xyz = frame.to_table(goal_xyz)
+    return problem.scene_constraint.scene_values(goal_xyz, goal_velocity)
 
 
 def table_frame_of(problem: Problem, parameters: Array | None) -> TableFrame | None:

@@ -48,7 +48,7 @@ class FreeMix(SceneFamily):
         grasps = []
         for _ in range(10):
             bearing = uniform(random, self.bearing)
-            radius = float(random.uniform(0.35, 0.65))
+            radius = random.uniform(0.35, 0.65)
             position = np.array(
                 [
                     radius * math.cos(bearing),
@@ -66,7 +66,7 @@ class FreeMix(SceneFamily):
 
     def _obstacle(self, random: np.random.Generator, index: int) -> Obstacle:
         a, b, c = (uniform(random, self.size) for _ in range(3))
-        share = float(random.random())
+        share = random.random()
         bearing = uniform(random, self.bearing)
         extent = math.hypot(a, b, c) / 2
         radius = max(uniform(random, self.radius), MIN_BASE_DISTANCE_M + extent)

@@ -141,7 +141,7 @@ def place_objects(
     count, widths, heights = objects
     for index in range(whole(random, count)):
         a, b, height = (uniform(random, size) for size in (widths, widths, heights))
-        is_box = bool(random.random() < 0.5)
+        is_box = random.random() < 0.5
         # The circle round the base, whatever the turn of a box.
         radius = math.hypot(a, b) / 2 if is_box else a / 2
         place = _free_place(random, area, radius, circles)
@@ -153,7 +153,7 @@ def place_objects(
         name = f"{prefix} {index + 1}"
         center = (x, y, z + height / 2)
         if is_box:
-            turn = float(random.uniform(-math.pi, math.pi))
+            turn = random.uniform(-math.pi, math.pi)
             furniture.box(name, center, (a, b, height), turn)
         else:
             furniture.cylinder(name, center, a / 2, height)

@@ -238,7 +238,7 @@ class _Generator:
         self, states: RestingStates, grasps: list[Array], random: np.random.Generator
     ) -> tuple[Array, Array] | None:
         """Return a start and a goal, or None after ``MAX_PAIRS`` attempts."""
-        may_be_straight = bool(random.random() < STRAIGHT_SHARE)
+        may_be_straight = random.random() < STRAIGHT_SHARE
         for _ in range(MAX_PAIRS):
             target = int(random.integers(len(grasps)))
             goal = grasps[target][random.integers(len(grasps[target]))]

@@ -65,7 +65,7 @@ class Bookshelf(SceneFamily):
                 from_above=False,
                 prefix=f"object {level + 1}",
             )
-            y = float(random.uniform(area[2], area[3]))
+            y = random.uniform(area[2], area[3])
             # A free place in front of the objects, halfway between two boards.
             shelf.grasp((0.08, y, z + spacing / 2), (1, 0, 0), tilt=0.4)
         return shelf.layout()

@@ -67,7 +67,7 @@ class Tabletop(SceneFamily):
             for _ in range(2):  # free places
                 x = random.uniform(area[0], area[1])
                 y = random.uniform(area[2], area[3])
-                table.grasp((float(x), float(y), 0.05), (0, 0, -1))
+                table.grasp((x, y, 0.05), (0, 0, -1))
             tables.append(table)
         return tables[0].layout(*tables[1:])
 

@@ -105,12 +105,9 @@ def _states(robot: Robot) -> Array:
     shares = np.random.default_rng(0).uniform(
         LIMIT_SHARE, 1 - LIMIT_SHARE, (BASE_CANDIDATES, robot.n)
     )
-    return np.asarray(
-        (
-            robot.position_lower
-            + shares * (robot.position_upper - robot.position_lower)
-        ).round(3)
-    )
+    return (
+        robot.position_lower + shares * (robot.position_upper - robot.position_lower)
+    ).round(3)
 
 
 def _measure_states(world: World, states: Array) -> tuple[Array, Array, Array]:

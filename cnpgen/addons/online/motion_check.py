@@ -76,7 +76,7 @@ class MotionChecker:
         with self._lock:
             _, world = self._open(part)
             world.set_path(q.T, dq.T, ddq.T, part.scene.poses[0], exact=False)
-            return np.asarray(world.torque.T)
+            return world.torque.T
 
     def _open(self, part: Plans) -> tuple[Problem, PathWorld]:
         """Return the problem of a plan and a world for it, which are kept."""
@@ -120,4 +120,4 @@ def _jerks(motion: SampledMotion, times: Array) -> Array:
     # Times are shifted inward at the ends, so that all of them are within the motion.
     low = np.clip(times - JERK_STEP_S, motion.start, motion.end_time - 3 * JERK_STEP_S)
     before, after = (motion.at(low + k * JERK_STEP_S).ddq for k in (0, 2))
-    return np.asarray((after - before).T / (2 * JERK_STEP_S))
+    return (after - before).T / (2 * JERK_STEP_S)

@@ -334,7 +334,7 @@ def _rotation_vector(D: Array) -> Array:
     from scipy.spatial.transform import Rotation
 
     vectors = Rotation.from_matrix(np.moveaxis(D, (0, 1), (-2, -1))).as_rotvec()
-    return np.asarray(np.moveaxis(vectors, -1, 0))
+    return np.moveaxis(vectors, -1, 0)
 
 
 def _angle_over_sine(cosine: Any) -> Any:

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from cnpgen.addons.scene_files.document_values import part, scalar
 from cnpgen.addons.scene_files.moveit_frames import (
     IDENTITY,
     FrameTable,
@@ -25,7 +26,6 @@ from cnpgen.addons.scene_files.moveit_shapes import (
 )
 from cnpgen.problems.scenes.scene_problem import SceneError, check_count
 from cnpgen.problems.scenes.scene_request import AttachedObject
-from cnpgen.problems.scenes.yaml_document import part, scalar
 
 _LOG = logging.getLogger(__name__)
 OPERATIONS = ("ADD", "REMOVE", "APPEND", "MOVE")  # in the order of their codes

@@ -75,7 +75,7 @@ def _explanations(
 
 def _mean_of_neighbors(values: Array) -> Array:
     """Return the means of neighbors."""
-    return np.asarray((values[1:] + values[:-1]) / 2)
+    return (values[1:] + values[:-1]) / 2
 
 
 def _rms(values: Array) -> float:

@@ -28,6 +28,7 @@ from cnpgen.errors import UsageError
 
 if TYPE_CHECKING:
     from cnpgen.addons.trajectories.evaluate_trajectories import TrajectoryEvaluation
+    from cnpgen.addons.trajectories.load_trajectories import LoadedTrajectories
 
 
 def add_options(options: Options) -> None:
@@ -69,8 +70,6 @@ def accepts(arguments: argparse.Namespace) -> bool:
 
 def run(arguments: argparse.Namespace) -> int:
     """Judge sampled trajectories."""
-    from cnpgen.addons.trajectories.evaluate_trajectories import evaluate_trajectories
-
     if arguments.tracking_error is not None:
         raise UsageError(
             "--tracking-error is for plans: --noise gives the error of sampled trajectories"
@@ -86,11 +85,28 @@ def run(arguments: argparse.Namespace) -> int:
         raise UsageError(
             f"{arguments.file} has no trajectory {arguments.plan}: {count} are numbered from 0"
         )
-    with Meter(
-        quiet=arguments.quiet or not sys.stderr.isatty(), noun="trajectory"
-    ) as meter:
-        meter.begin(f"judging {arguments.file}", count)
-        found = evaluate_trajectories(
+    found = _judged(arguments, loaded)
+    if arguments.json:
+        write_json(arguments.file, loaded, found)
+    else:
+        print(summary_text(arguments.file, found))
+        if arguments.list:
+            print(f"\n{listing_text(found, loaded.labels)}")
+    if arguments.plot:
+        _draw_trajectory(found, arguments.plot, arguments.plan, loaded.labels)
+    return 0 if found.valid.all() else 1
+
+
+def _judged(
+    arguments: argparse.Namespace, loaded: "LoadedTrajectories"
+) -> "TrajectoryEvaluation":
+    """Judge the trajectories of a file, and show the progress."""
+    from cnpgen.addons.trajectories.evaluate_trajectories import evaluate_trajectories
+
+    quiet = arguments.quiet or not sys.stderr.isatty()
+    with Meter(quiet=quiet, noun="trajectory") as meter:
+        meter.begin(f"judging {arguments.file}", len(loaded.trajectories))
+        return evaluate_trajectories(
             loaded.problem,
             loaded.trajectories,
             interpolation=arguments.interpolation,
@@ -102,15 +118,6 @@ def run(arguments: argparse.Namespace) -> int:
             workers=arguments.workers or 1,
             progress=meter,
         )
-    if arguments.json:
-        write_json(arguments.file, loaded, found)
-    else:
-        print(summary_text(arguments.file, found))
-        if arguments.list:
-            print(f"\n{listing_text(found, loaded.labels)}")
-    if arguments.plot:
-        _draw_trajectory(found, arguments.plot, arguments.plan, loaded.labels)
-    return 0 if found.valid.all() else 1
 
 
 def _draw_trajectory(

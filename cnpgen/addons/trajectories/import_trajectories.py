@@ -82,7 +82,7 @@ class ImportedTrajectories:
     @property
     def meets_samples(self) -> NDArray[np.bool_]:
         """Whether each plan is within the stated error of its samples, shape (N,)."""
-        return np.asarray(self.deviation <= self.max_deviation)
+        return self.deviation <= self.max_deviation
 
 
 @checked_arguments

@@ -15,8 +15,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cnpgen.addons.trajectories.lerobot_tables import (
+    LEROBOT_ACTION,
     LEROBOT_ENVIRONMENT,
     LEROBOT_INFO,
+    LEROBOT_STATE,
 )
 from cnpgen.errors import UsageError, requires_extra
 from cnpgen.plans.exporter import ExportedSet, Exporter, SampledPlan
@@ -32,9 +34,6 @@ MAX_DATA_FILE_MB = 100
 MAX_VIDEO_FILE_MB = 200  # there are none, but readers expect the number
 DATA_PATH = "data/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"
 EPISODES_PATH = "meta/episodes/chunk-000/file-000.parquet"
-STATE = "observation.state"
-ENVIRONMENT = LEROBOT_ENVIRONMENT
-ACTION = "action"
 QUANTILES = (0.01, 0.1, 0.5, 0.9, 0.99)
 _INDICES = {
     "timestamp": "float32",
@@ -94,9 +93,9 @@ def _names(exported: ExportedSet) -> dict[str, list[str]]:
     ]
     state = [*joints, *(f"{joint}_velocity" for joint in joints)]
     return {
-        STATE: state,
-        **({ENVIRONMENT: environment} if environment else {}),
-        ACTION: list(joints),
+        LEROBOT_STATE: state,
+        **({LEROBOT_ENVIRONMENT: environment} if environment else {}),
+        LEROBOT_ACTION: list(joints),
     }
 
 
@@ -151,9 +150,11 @@ def _frames(
     count = len(plan.t) - 1
     frame = np.arange(count)
     return {
-        STATE: np.concatenate([plan.q[:-1], plan.dq[:-1]], axis=1).astype(np.float32),
-        ENVIRONMENT: np.tile(environment.astype(np.float32), (count, 1)),
-        ACTION: plan.q[1:].astype(np.float32),
+        LEROBOT_STATE: np.concatenate([plan.q[:-1], plan.dq[:-1]], axis=1).astype(
+            np.float32
+        ),
+        LEROBOT_ENVIRONMENT: np.tile(environment.astype(np.float32), (count, 1)),
+        LEROBOT_ACTION: plan.q[1:].astype(np.float32),
         "timestamp": (frame / rate).astype(np.float32),
         "frame_index": frame,
         "episode_index": np.full(count, number),

@@ -135,7 +135,7 @@ def _friction_changes(
     # Friction enters the power times the velocity.
     if condition.condition.unit == POWER_UNIT:
         changes = [change * (np.abs(dq) + error)[joints] for change in changes]
-    return np.asarray(np.maximum.reduceat(np.max(changes, axis=0), starts, axis=1))
+    return np.maximum.reduceat(np.max(changes, axis=0), starts, axis=1)
 
 
 def _changes(  # noqa: PLR0917 - as of uncertainty_of

@@ -279,8 +279,8 @@ def _point(
     if curve is not None and curve.points is not None:
         return np.asarray(curve.points[frame].mean(axis=0))
     if margin.part in joints:
-        return np.asarray(poses[1 + list(joints).index(margin.part), :3, 3])
-    return np.asarray(poses[-1, :3, 3])
+        return poses[1 + list(joints).index(margin.part), :3, 3]
+    return poses[-1, :3, 3]
 
 
 def _condition(curve: ConditionCurve) -> dict[str, Any]:
@@ -446,4 +446,4 @@ def _disc_corners(bottom: Array, radius: float, height: float) -> Array:
 
 
 def _corners(low: Array, high: Array) -> Array:
-    return np.asarray((low + high) / 2 + CUBE * (high - low))
+    return (low + high) / 2 + CUBE * (high - low)
