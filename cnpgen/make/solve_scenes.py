@@ -210,29 +210,32 @@ def solve_scenes(
     if chosen.begin is not None:
         chosen.begin(len(scenes), 0)
     refine = _refiner(chosen, progress, options, workers=workers, discard=discard)
-    capacity = capacity_of(scenes)
     found = dict[int, tuple[Plans, Attempt]]()
     times = NO_TIME
-    journals = list[Path]()
     # Scenes of one capacity share kernels; each group has its own journal.
-    for own, indices in _groups(scenes):
-        file = None if journal is None else Path(f"{journal}.{len(journals)}")
-        journals += [] if file is None else [file]
+    groups = _groups(scenes)
+    for number, (own, indices) in enumerate(groups):
         of_group = [(index, goals[index]) for index in indices]
         plans = _adjusted(_plans_of(loaded, scenes, of_group, own), chosen)
-        refinement = refine(plans, journal=file)
+        refinement = refine(plans, journal=_journal_of(journal, number))
         times += refinement.times
         # Plans of one file have the same obstacles: smaller groups get parked ones.
-        wide = with_wider_capacity(_without_options(refinement), loaded, own, capacity)
-        attempts = zip(indices, refinement.results, strict=True)
-        for row, (index, attempt) in enumerate(attempts):
-            found[index] = wide[row], _with_reason(attempt, goals[index])
+        wide = with_wider_capacity(
+            _without_options(refinement), loaded, own, capacity_of(scenes)
+        )
+        attempts = map(_with_reason, refinement.results, [g for _, g in of_group])
+        found |= dict(zip(indices, zip(wide, attempts, strict=True), strict=True))
     every, results = zip(*(found[index] for index in range(len(scenes))), strict=True)
-    solved = SolvedScenes(tuple(scenes), concatenate(every), results, times)
     # The journals serve to resume; a finished run needs none.
-    for file in journals:
-        file.unlink(missing_ok=True)
-    return solved
+    for number in range(len(groups)):
+        if (file := _journal_of(journal, number)) is not None:
+            file.unlink(missing_ok=True)
+    return SolvedScenes(tuple(scenes), concatenate(every), results, times)
+
+
+def _journal_of(journal: str | Path | None, number: int) -> Path | None:
+    """Return the journal of a group of scenes, if there is one of the whole run."""
+    return None if journal is None else Path(f"{journal}.{number}")
 
 
 def _requested(

@@ -17,7 +17,7 @@ from cnpgen.losses.margins import Margins, suggested_margins
 from cnpgen.losses.metric import Metric, suggested_weights
 from cnpgen.losses.plan_loss import PlanLoss
 from cnpgen.machine.versions import __version__
-from cnpgen.planner.control_points import Projection, make_projection
+from cnpgen.planner.control_points import make_projection
 from cnpgen.planner.inference_pipeline import (
     InferencePipeline,
     LoadedProblem,
@@ -92,13 +92,13 @@ def prepare_run(
         zero_conditions=zero,
         training=_record(source, settings, command, rows, initial_model),
     )
-    loss = _loss(loaded, settings)
     held_out = source.checked(check_rows)
-    spec = loaded.problem.trajectory
-    along = inference.prepare.along
-    projection = _projection(loaded, settings, boundary.fixed_at_goal)
+    loss = _loss(loaded, settings)
+    learner = Learner(
+        architecture, loaded.problem.trajectory, loss, settings, features=features
+    )
     run = Run(
-        Learner(architecture, spec, loss, settings, projection, along, features),
+        _with_projection(learner, loaded, inference, boundary.fixed_at_goal),
         names=loss.terms,
         budgets=dict(zip(loss.terms[1:], loss.budgets.tolist(), strict=True)),
         rows=rows,
@@ -166,16 +166,21 @@ def _rows(
     )
 
 
-def _projection(
-    loaded: LoadedProblem, settings: TrainingSettings, fixed_at_goal: int
-) -> Projection | None:
-    return make_projection(
+def _with_projection(
+    learner: Learner,
+    loaded: LoadedProblem,
+    inference: InferencePipeline,
+    fixed_at_goal: int,
+) -> Learner:
+    """Return a learner that projects paths onto the equalities, and that has tasks along the projected lines."""
+    projection = make_projection(
         loaded.problem.for_planning,
         loaded.kernels,
-        steps=settings.projection_steps,
+        steps=learner.settings.projection_steps,
         fixed_at_goal=fixed_at_goal,
-        within_limits=settings.within_limits,
+        within_limits=learner.settings.within_limits,
     )
+    return replace(learner, projection=projection, along=inference.prepare.along)
 
 
 def _initial_features(
