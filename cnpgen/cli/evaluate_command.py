@@ -30,11 +30,20 @@ def add_options(parser: Parser) -> None:
         type=Path,
         help="plan file, .h5, or sampled trajectories",
     )
-    text = "the problem of the plans; its tolerances are used"
-    option("--problem", metavar="NAME|FILE", type=recipe_names.problem, help=text)
+    option(
+        "--problem",
+        metavar="NAME|FILE",
+        type=recipe_names.problem,
+        help="the problem of the plans; its tolerances are used",
+    )
     option("--extrapolate", action="store_true", help=EXTRAPOLATE)
-    text = "time between two samples (default: 1ms, at most 10ms)"
-    option("--step", metavar="S", type=values.seconds, default=1e-3, help=text)
+    option(
+        "--step",
+        metavar="S",
+        type=values.seconds,
+        default=1e-3,
+        help="time between two samples (default: 1ms, at most 10ms)",
+    )
     text = "largest tracking error of the joints, such as 2deg: position limits, clearances and the manifold hold"
     text += " within it; one number, or one per joint (default: exact tracking)"
     option("--tracking-error", metavar="E,...", type=values.tracking_errors, help=text)
@@ -55,8 +64,12 @@ def add_options(parser: Parser) -> None:
         type=values.plot_file,
         help="draw one plan or trajectory: .png, .pdf or .svg",
     )
-    text = "plan or trajectory to draw; default the first that is not valid, or 0"
-    option("--plan", metavar="I", type=values.natural, help=text)
+    option(
+        "--plan",
+        metavar="I",
+        type=values.natural,
+        help="plan or trajectory to draw; default the first that is not valid, or 0",
+    )
     add_json(parser)
 
 
@@ -120,7 +133,6 @@ def _draw(found: "Evaluation", picture: str, index: int | None) -> None:
     chosen = _chosen(found) if index is None else index
     problem, robot = open_problem(plans.problem)
     verdict = found.verdicts[chosen]
-    note = f"sample {plans.sample_id[chosen]}: {verdict}"
     plot_plan(
         problem,
         robot,
@@ -128,7 +140,7 @@ def _draw(found: "Evaluation", picture: str, index: int | None) -> None:
         chosen,
         picture,
         scene=plans.scene[chosen],
-        note=note,
+        note=f"sample {plans.sample_id[chosen]}: {verdict}",
         verdict=verdict,
     )
     print(f"drawn: plan {chosen} in {picture}", file=sys.stderr)

@@ -69,11 +69,18 @@ in either case. If OUT is there already as the result of the same request, the c
 
 def add_options(parser: Parser) -> None:
     parser.add_argument("file", metavar="FILE", type=Path, help="plan file, .h5")
-    text = "output file (default: FILE-refined.h5 beside it)"
-    parser.add_argument("-o", "--out", metavar="OUT", type=Path, help=text)
-    text = "the problem of the plans; its tolerances are used"
     parser.add_argument(
-        "--problem", metavar="NAME|FILE", type=recipe_names.problem, help=text
+        "-o",
+        "--out",
+        metavar="OUT",
+        type=Path,
+        help="output file (default: FILE-refined.h5 beside it)",
+    )
+    parser.add_argument(
+        "--problem",
+        metavar="NAME|FILE",
+        type=recipe_names.problem,
+        help="the problem of the plans; its tolerances are used",
     )
     parser.add_argument("--extrapolate", action="store_true", help=EXTRAPOLATE)
     add_refine_options(parser)
@@ -123,12 +130,24 @@ def add_refining(parser: Options) -> None:
     text = "relative change of the objective at which the iteration converges (default: 1e-3; without an initial"
     text += " guess a tenth of it, among obstacles a twentieth)"
     option("--tolerance", metavar="X", type=float, help=text)
-    text = "time per plan, such as 10ms: returns the best plan until then, never worse than the input"
-    option("--deadline", metavar="S", type=values.seconds_with_unit, help=text)
-    text = "largest difference of every joint from the input path, such as 2deg (default: only the ends are kept)"
-    option("--stay-within", metavar="E", type=values.angle, help=text)
-    text = "report for every invalid plan whether its problem is proven infeasible"
-    option("--explain", action="store_true", help=text)
+    option(
+        "--deadline",
+        metavar="S",
+        type=values.seconds_with_unit,
+        help="time per plan, such as 10ms: returns the best plan until then, never worse than the input",
+    )
+    option(
+        "--stay-within",
+        metavar="E",
+        type=values.angle,
+        help="largest difference of every joint from the input path, such as 2deg (default: only the ends "
+        "are kept)",
+    )
+    option(
+        "--explain",
+        action="store_true",
+        help="report for every invalid plan whether its problem is proven infeasible",
+    )
 
 
 def refine_and_save(

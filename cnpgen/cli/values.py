@@ -132,8 +132,9 @@ def seconds_with_unit(text: str) -> float:
     time = seconds(text)
     # The number ends without a letter: it has no unit.
     if text.strip()[-1:].isdigit() or text.strip().endswith("."):
-        text = f"expected a time with its unit, such as 10ms; got {text!r}, is it {text}ms or {text}s?"
-        raise ArgumentTypeError(text)
+        raise ArgumentTypeError(
+            f"expected a time with its unit, such as 10ms; got {text!r}, is it {text}ms or {text}s?"
+        )
     return time
 
 

@@ -105,8 +105,10 @@ def observer_of(
 ) -> BatchObserver:
     """Return the observer of the scenes of a dataset, for batches with the field ``obstacle_poses``."""
     if not spec.scene_obstacles:
-        text = f"{spec.name} has no scenes to observe: expected a dataset such as panda-scenes, or a BatchObserver"
-        raise DatasetError(text)
+        raise DatasetError(
+            f"{spec.name} has no scenes to observe: expected a dataset such as panda-scenes, or a "
+            "BatchObserver"
+        )
     return BatchObserver(kind, partial(_scenes_of, problem_obstacles(spec)), seed)
 
 

@@ -364,6 +364,8 @@ def _installed(library: str | None) -> str:
     candidates = LIBRARIES if library is None else (library,)
     installed = next((name for name in candidates if find_spec(name) is not None), None)
     if installed is None:
-        text = f"a frame needs {' or '.join(candidates)}, not installed here: pip install 'cnpgen[{candidates[0]}]'"
-        raise MissingExtraError(text)
+        raise MissingExtraError(
+            f"a frame needs {' or '.join(candidates)}, not installed here: pip install "
+            f"'cnpgen[{candidates[0]}]'"
+        )
     return installed

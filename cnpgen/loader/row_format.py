@@ -286,8 +286,10 @@ def _own(
     spec: DatasetSpec, own: Normalization | None, normalize: object
 ) -> Normalization | None:
     if not isinstance(normalize, bool | np.bool_):
-        text = f"must be True, False or the normalization of a dataset, got {normalize!r:.100}"
-        raise UsageError(text, argument="normalize")
+        raise UsageError(
+            f"must be True, False or the normalization of a dataset, got {normalize!r:.100}",
+            argument="normalize",
+        )
     if normalize and own is None:
         raise DatasetError(
             f"{spec.name} has no training rows for the normalization; pass normalize=False, or the normalization of"

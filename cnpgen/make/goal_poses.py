@@ -309,8 +309,10 @@ class PoseTasks:
                 limit := PLAUSIBLE_MAX[unit]
             ):
                 hint = suggested_unit(largest, unit, high=limit)
-                text = f"must be at most {limit:.4g} {unit}, got {tolerances[name]} in task {task}{hint}"
-                raise UsageError(text, argument=name)
+                raise UsageError(
+                    f"must be at most {limit:.4g} {unit}, got {tolerances[name]} in task {task}{hint}",
+                    argument=name,
+                )
             if (tolerances[name] < 0).any():
                 raise UsageError(
                     f"must not be negative, got {tolerances[name]} in task {task}",

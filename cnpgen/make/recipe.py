@@ -274,9 +274,11 @@ def load_notes(recipe: DatasetRecipe) -> str:
         return ""
     card = recipe.path.with_suffix(".md")
     try:
-        hint = "; it becomes part of the dataset's card"
         return (
-            utf8_text(read_own(card, recipe.path, "notes"), hint=hint)
+            utf8_text(
+                read_own(card, recipe.path, "notes"),
+                hint="; it becomes part of the dataset's card",
+            )
             if card.is_file()
             else ""
         )

@@ -224,10 +224,17 @@ def stored_fields(steps: Sequence[PipelineStep], context: Context) -> tuple[Fiel
 
 def bookkeeping_fields(*, scenes: bool = False) -> tuple[Field, ...]:
     """Return the bookkeeping fields of every dataset, and with ``scenes`` that of the scene of a row."""
-    text = "sample_id of the first row in the same scene"
     return (
         *(
-            (Field(SCENE_ID, "1", text, role="context", dtype="int64"),)
+            (
+                Field(
+                    SCENE_ID,
+                    "1",
+                    "sample_id of the first row in the same scene",
+                    role="context",
+                    dtype="int64",
+                ),
+            )
             if scenes
             else ()
         ),

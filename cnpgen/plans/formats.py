@@ -192,8 +192,11 @@ class JointTrajectory(Exporter):
         points = ",\n    ".join(_point_text(plan, k) for k in range(len(plan.t)))
         header = json.dumps({"stamp": {"sec": 0, "nanosec": 0}, "frame_id": ""})
         names = json.dumps(exported.joint_names)
-        text = f'{{\n  "header": {header},\n  "joint_names": {names},\n  "points": [\n    {points}\n  ]\n}}\n'
-        write_file(path, text)
+        write_file(
+            path,
+            f'{{\n  "header": {header},\n  "joint_names": {names},\n  "points": [\n    {points}\n  '
+            "]\n}\n",
+        )
 
 
 @dataclass(frozen=True)

@@ -122,8 +122,9 @@ def errors_of_file(path: Path) -> Iterator[None]:
         yield
     except UsageError as error:
         field = f"{error.argument} " if error.is_predicate else ""
-        text = f"{path}: {field}{error.args[0]}"
-        raise DatasetError(text, remedies=error.remedies) from error
+        raise DatasetError(
+            f"{path}: {field}{error.args[0]}", remedies=error.remedies
+        ) from error
 
 
 def _columns(path: Path, file: Hdf5) -> dict[str, NDArray[Any]]:

@@ -139,8 +139,10 @@ def problem_errors(raw: ProblemTables) -> Iterator[str]:
     for index, obstacle in tables(table, "obstacle"):
         if index == 0 and uses <= BUILT_IN[CONSTRAINTS].keys() - using:
             # Plug-ins may use them.
-            text = 'no constraint uses it: add a [[constraint]] with use = "robot-clearance" and a tolerance'
-            yield (where / "obstacle" / index).message(text)
+            yield (where / "obstacle" / index).message(
+                'no constraint uses it: add a [[constraint]] with use = "robot-clearance" and a '
+                "tolerance"
+            )
         if obstacle.get("below") and "object" not in table:
             yield (where / "obstacle" / index / "below").message(
                 "nothing stands on the obstacle: there is no [object]"
@@ -387,8 +389,10 @@ def _repeated(raw: ProblemTables, array: str, key: str) -> Iterator[str]:
         name = entry if "link" in entry else entry.get(key)
         if key in entry and name in seen:
             article = "an" if array[0] in "aeiou" else "a"
-            text = f"there is {article} {array} {show(entry[key])} already: edit that one, or remove one of them"
-            yield (raw.where / array / index / key).message(text)
+            yield (raw.where / array / index / key).message(
+                f"there is {article} {array} {show(entry[key])} already: edit that one, or remove one "
+                "of them"
+            )
         seen.append(name)
 
 

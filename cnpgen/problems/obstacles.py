@@ -66,12 +66,15 @@ def scene_of(
         parameters = np.tile(problem.nominal_parameters, (len(start_xyz), 1))
     if constraint is not None:
         if goal_velocity is None:
-            text = f"is missing: the problem {problem.name!r} needs it"
-            raise UsageError(text, argument="goal_velocity")
+            raise UsageError(
+                f"is missing: the problem {problem.name!r} needs it",
+                argument="goal_velocity",
+            )
         shapes = [xyz.shape for xyz in (start_xyz, goal_xyz, goal_velocity)]
         if set(shapes) != {(len(start_xyz), 3)}:
-            text = f"positions and velocities must have one shape (N, 3), got {shapes}"
-            raise UsageError(text)
+            raise UsageError(
+                f"positions and velocities must have one shape (N, 3), got {shapes}"
+            )
         # The puck lies on the table, whose frame differs from sample to sample.
         if (frame := table_frame_of(problem, parameters)) is not None:
             goal_velocity = frame.along_table(goal_velocity)

@@ -111,8 +111,11 @@ def read_problem(path: Path, errors: list[str]) -> Problem | None:
             errors.append(f"{path}: drive.urdf_dynamics: missing; {undecided}")
         # Files of version 1 ignored friction silently: an error would reject them.
         elif undecided:
-            message = f"{path}: friction of the URDF is ignored; {undecided}"
-            warnings.warn(message, UserWarning, stacklevel=3)
+            warnings.warn(
+                f"{path}: friction of the URDF is ignored; {undecided}",
+                UserWarning,
+                stacklevel=3,
+            )
     spec = replace(problem.robot, geometry=raw.geometry)
     constraints = raw.with_object_clearance(problem)
     return replace(

@@ -60,8 +60,10 @@ class RefineOptions:
         if self.weight is not None:
             not_negative("weight", self.weight)
             if "=" in self.objective:
-                text = f"must be None: the objective {self.objective!r} has weights"
-                raise UsageError(text, argument="weight")
+                raise UsageError(
+                    f"must be None: the objective {self.objective!r} has weights",
+                    argument="weight",
+                )
         integer("max_iterations", self.max_iterations, least=0)
         if not 0 < number("tolerance", self.tolerance) < 1:
             raise UsageError(
@@ -87,8 +89,10 @@ class RefineOptions:
         usual = {"tolerance": DEFAULT_SETTINGS.cost_tolerance}
         for name in ("tolerance", "deadline", "stay_within"):
             if not self.max_iterations and getattr(self, name) != usual.get(name):
-                text = "has no effect with 0 iterations, which only scale plans in time"
-                raise UsageError(text, argument=name)
+                raise UsageError(
+                    "has no effect with 0 iterations, which only scale plans in time",
+                    argument=name,
+                )
 
     def document(self) -> dict[str, Any]:
         """Return the options for JSON, without a deadline, a distance or a limit of None."""

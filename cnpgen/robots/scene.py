@@ -144,10 +144,10 @@ class Scene:
 
     def _check_sample(self, sample: int, argument: str) -> None:
         if not -len(self) <= sample < len(self):
-            text = (
-                f"there is no sample {sample}: {len(self)} samples are numbered from 0"
+            raise SampleIndexError(
+                f"there is no sample {sample}: {len(self)} samples are numbered from 0",
+                concerns=argument,
             )
-            raise SampleIndexError(text, concerns=argument)
 
 
 def sample_obstacles(obstacles: Sequence[Obstacle]) -> dict[str, list[int]]:

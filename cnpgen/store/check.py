@@ -150,8 +150,14 @@ def _check_manifest(
     for name in (name for name in LISTED if name in manifest["files"]):
         entry = manifest["files"][name]
         if name == CROISSANT and not (folder / name).exists():
-            text = "is missing, as in published datasets"
-            findings.append(Finding(name, text, note=True, hint=REMAKE_HINT))
+            findings.append(
+                Finding(
+                    name,
+                    "is missing, as in published datasets",
+                    note=True,
+                    hint=REMAKE_HINT,
+                )
+            )
         else:
             findings += _check_file(folder, name, entry["sha256"], entry["bytes"])
     return findings, manifest
@@ -245,8 +251,13 @@ def _check_sidecar(
         else _check_file(folder, task.sidecar, entry["sidecar"]["sha256"])
     )
     if record.specification_fingerprint != spec.version_with(task).fingerprint:
-        text = f"belongs to another specification ({record.specification_fingerprint[:12]}...)"
-        findings.append(Finding(task.sidecar, text, hint=REMAKE_HINT))
+        findings.append(
+            Finding(
+                task.sidecar,
+                f"belongs to another specification ({record.specification_fingerprint[:12]}...)",
+                hint=REMAKE_HINT,
+            )
+        )
     return findings, expected or (record.sha256, record.bytes)
 
 

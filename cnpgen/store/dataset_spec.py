@@ -353,8 +353,10 @@ def _check_sizes(spec: DatasetSpec) -> None:
 def _check_names(spec: DatasetSpec) -> None:
     for split in spec.splits:
         if not SPLIT_NAME.fullmatch(split):
-            text = f"the name of a split must have letters, digits and '_' and start with a letter, got {split!r}"
-            raise UsageError(text)
+            raise UsageError(
+                "the name of a split must have letters, digits and '_' and start with a letter, got "
+                f"{split!r}"
+            )
     names = [item.name for item in spec.fields]
     if not names or len(set(names)) != len(names) or len(names) > MAX_FIELDS:
         raise UsageError(

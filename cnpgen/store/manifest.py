@@ -174,8 +174,10 @@ def _created(summary: DatasetSummary) -> str:
         instant = datetime.fromtimestamp(int(last), UTC) if fixed is None else fixed
         return instant.strftime("%Y-%m-%dT%H:%M:%SZ")
     except (ValueError, OverflowError, OSError) as error:
-        text = f"the creation time of the dataset is unknown: the record of a shard has no valid start time ({error})"
-        raise DatasetError(text) from error
+        raise DatasetError(
+            "the creation time of the dataset is unknown: the record of a shard has no valid start "
+            f"time ({error})"
+        ) from error
 
 
 def _manifest(folder: Path, summary: DatasetSummary, *, created: str) -> dict[str, Any]:

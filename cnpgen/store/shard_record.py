@@ -224,8 +224,10 @@ def load_committed(folder: Path, spec: DatasetSpec, task: ShardTask) -> ShardRec
     """
     record = load_record(folder, task)
     if record.specification_fingerprint != spec.version_with(task).fingerprint:
-        text = f"{folder / task.sidecar} belongs to another specification ({record.specification_fingerprint[:12]}...)"
-        raise DatasetError(text)
+        raise DatasetError(
+            f"{folder / task.sidecar} belongs to another specification "
+            f"({record.specification_fingerprint[:12]}...)"
+        )
     path = folder / task.file
     # The size is a quick check; the sha256 is compared where rows are read.
     size = path.stat().st_size if path.is_file() else None

@@ -79,8 +79,7 @@ def prepare_run(
     config, blocks, features = _inputs(loaded, settings, boundary, initial_model)
     inference = _inference(loaded, config, boundary, zero, blocks)
     architecture = _architecture(loaded, settings, blocks, boundary)
-    if initial_model is not None:
-        _check_initial_model(initial_model, architecture, settings, loaded, zero)
+    _check_initial_model(initial_model, architecture, settings, loaded, zero)
     rows, features = _rows(problems, inference, blocks, features, initial_model)
     rows = _with_demonstrations(rows, source, loaded) if settings.imitation else rows
     make_model = partial(
@@ -92,19 +91,16 @@ def prepare_run(
         zero_conditions=zero,
         training=_record(source, settings, command, rows, initial_model),
     )
-    held_out = source.checked(check_rows)
     loss = _loss(loaded, settings)
-    learner = Learner(
-        architecture, loaded.problem.trajectory, loss, settings, features=features
-    )
+    spec = loaded.problem.trajectory
+    learner = Learner(architecture, spec, loss, settings, features=features)
     run = Run(
         _with_projection(learner, loaded, inference, boundary.fixed_at_goal),
-        names=loss.terms,
-        budgets=dict(zip(loss.terms[1:], loss.budgets.tolist(), strict=True)),
+        loss=loss,
         rows=rows,
         metric=_metric(loss, settings),
         model=lambda values: make_model(parameters=values.astype(np.float32)),
-        validate=lambda model: validate(model, inference, held_out),
+        validate=partial(validate, inference, source.checked(check_rows)),
         initial_parameters=None if initial_model is None else initial_model.parameters,
     )
     return run, inference
@@ -266,13 +262,15 @@ def _with_demonstrations(
 
 
 def _check_initial_model(
-    model: Model,
+    model: Model | None,
     architecture: Architecture,
     settings: TrainingSettings,
     loaded: LoadedProblem,
     zero: tuple[str, ...],
 ) -> None:
-    """Raise an error if the model's parameters cannot be used in this run."""
+    """Raise an error if the parameters of an initial model cannot be used in this run."""
+    if model is None:
+        return
     if model.problem.comparable_sha256 != loaded.record.comparable_sha256:
         differs = ", ".join(loaded.record.differences(model.problem)[:4])
         raise UsageError(
@@ -380,7 +378,7 @@ def _fresh(run: Run, steps: int) -> State:
             rate_bias=settings.rate_bias,
         )
     return start_state(
-        parameters, terms=len(run.names), steps=steps, imitation=settings.imitation
+        parameters, terms=len(run.loss.terms), steps=steps, imitation=settings.imitation
     )
 
 
@@ -403,9 +401,9 @@ def _step_seconds(run: Run) -> float:
 
 
 def validate(
-    model: Model,
     inference: InferencePipeline,
     problems: TrainingProblems,
+    model: Model,
     *,
     workers: int | None = 1,
 ) -> dict[str, Any]:

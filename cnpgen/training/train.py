@@ -196,7 +196,7 @@ def _train(
         # Other rows than those that selected the best model, so that the score has no
         # selection bias.
         rows = request.source.judged(MAX_SCORED_ROWS, after=request.check_rows)
-        score = validate(best, inference, rows, workers=workers)
+        score = validate(inference, rows, best, workers=workers)
         model = _save(best, request, state, log, score)
     clock.computed_here()
     return Trained(model, out, score, times=clock.times())

@@ -10,6 +10,7 @@ import numpy as np
 from cnpgen.arrays import AnyArray
 from cnpgen.errors import MachineError
 from cnpgen.losses.metric import Metric
+from cnpgen.losses.plan_loss import PlanLoss
 from cnpgen.losses.quadrature import rotating_shift
 from cnpgen.machine.signals import signals_deferred
 from cnpgen.planner.model import Model
@@ -30,7 +31,7 @@ SHIFT_STRIDE = 7
 class Run:
     """One run.
 
-    ``budgets`` maps a term of the loss to its acceptable value, from the problem file.
+    ``loss`` has the terms and their acceptable values, from the problem file.
     ``metric`` has the weights of the constraint terms. ``model`` makes a model of
     parameters. ``validate`` scores it: a record for the log with a ``score``, the
     larger the better. Without ``initial_parameters``, they are random. ``order`` is the
@@ -38,8 +39,7 @@ class Run:
     """
 
     learner: Learner
-    names: tuple[str, ...]
-    budgets: Mapping[str, float]
+    loss: PlanLoss
     rows: Rows
     metric: Metric
     model: Callable[[AnyArray], Model]
@@ -165,13 +165,15 @@ class Run:
 
     def _means(self, state: State, sums: Sums) -> dict[str, Any]:
         means = sums.terms / sums.steps
+        # The first term is that of the task.
+        constraints = self.loss.terms[1:]
         weights = self.metric.weights(state.progress(state.adam.step - 1))
         return {
             # L = task loss + sum of weight times constraint term
             "loss": float(means[0] + means[1:] @ weights),
-            "terms": dict(zip(self.names, means.tolist(), strict=True)),
-            "weights": dict(zip(self.names[1:], weights.tolist(), strict=True)),
-            "budgets": dict(self.budgets),
+            "terms": dict(zip(self.loss.terms, means.tolist(), strict=True)),
+            "weights": dict(zip(constraints, weights.tolist(), strict=True)),
+            "budgets": dict(zip(constraints, self.loss.budgets.tolist(), strict=True)),
         }
 
     def _check(self, state: State) -> dict[str, Any]:

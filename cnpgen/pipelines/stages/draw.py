@@ -138,11 +138,10 @@ def check_reach(
 
 def position_field(end: str, low: Sequence[float], high: Sequence[float]) -> Field:
     """Describe the field of the tip position at an end, bounded by a box [m]."""
-    text = f"{end} position of the tip"
     return Field(
         f"{end}_xyz",
         "m",
-        text,
+        f"{end} position of the tip",
         3,
         ("x", "y", "z"),
         "context",
@@ -289,12 +288,11 @@ class DrawParameters(Stage):
             tuple(getattr(span, end) for span in ranges.ranges)
             for end in ("low", "high")
         )
-        text = "parameters of the problem"
         return (
             Field(
                 "parameters",
                 ranges.units,
-                text,
+                "parameters of the problem",
                 len(ranges),
                 ranges.names,
                 valid_min=low,

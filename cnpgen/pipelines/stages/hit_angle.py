@@ -26,12 +26,11 @@ class _HitAngle(Stage):
     def outputs(self, context: Context) -> tuple[Field, ...]:
         low = (-float(np.pi),)
         high = (float(np.pi),)
-        text = "direction of the hit about world z, from world x"
         return (
             Field(
                 "hit_angle",
                 "rad",
-                text,
+                "direction of the hit about world z, from world x",
                 role="context",
                 frame="world",
                 valid_min=low,

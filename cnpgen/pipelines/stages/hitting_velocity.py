@@ -67,7 +67,6 @@ class HittingVelocity(Stage):
         return f"solve the linear program for the fastest joint velocity along the hit{slower}"
 
     def outputs(self, context: Context) -> tuple[Field, ...]:
-        text = "highest possible speed along the hit at the goal configuration"
         return (
             context.joint_field(
                 "goal_dq", "rad/s", "joint velocities at the goal", "target"
@@ -79,7 +78,13 @@ class HittingVelocity(Stage):
                 role="context",
                 frame="world",
             ),
-            Field("hit_speed_max", "m/s", text, role="diagnostic", frame="world"),
+            Field(
+                "hit_speed_max",
+                "m/s",
+                "highest possible speed along the hit at the goal configuration",
+                role="diagnostic",
+                frame="world",
+            ),
         )
 
     def prepare(self, context: Context) -> StageFunction:

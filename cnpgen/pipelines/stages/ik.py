@@ -443,8 +443,14 @@ class Home(GuessedIK):
         )
 
     def outputs(self, context: Context) -> tuple[Field, ...]:
-        text = "joint positions that those at the goal are chosen close to"
-        return (context.joint_field("home_q", "rad", text, "diagnostic"),)
+        return (
+            context.joint_field(
+                "home_q",
+                "rad",
+                "joint positions that those at the goal are chosen close to",
+                "diagnostic",
+            ),
+        )
 
     def writes(self, context: Context) -> tuple[str, ...]:
         return "home_q", "home_xyz"

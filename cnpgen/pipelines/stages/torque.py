@@ -28,12 +28,11 @@ class GravityTorque(Stage):
         return f"require that the torque that holds the {self.end} configuration, payload included, is within its limits"
 
     def outputs(self, context: Context) -> tuple[Field, ...]:
-        text = f"largest holding torque at the {self.end}, as a fraction of its planning limit"
         return (
             Field(
                 f"{self.end}_torque_ratio",
                 "1",
-                text,
+                f"largest holding torque at the {self.end}, as a fraction of its planning limit",
                 role="diagnostic",
                 valid_min=(0.0,),
                 valid_max=(1.0,),

@@ -81,6 +81,8 @@ def read_csv_table(path: Path, *, example: str) -> CsvTable:
         raise DatasetError(f"{path}: the column {twice[0]!r} is there more than once")
     for number, row in lines[1:]:
         if len(row) != len(names):
-            text = f"{path}: line {number} has {len(row)} values, the first line names {len(names)} columns"
-            raise DatasetError(text)
+            raise DatasetError(
+                f"{path}: line {number} has {len(row)} values, the first line names {len(names)} "
+                "columns"
+            )
     return CsvTable(path, tuple(names), tuple(lines[1:]))

@@ -408,8 +408,9 @@ def _checked_file(path: Path, content: bytes | None) -> Iterator[tuple[Any, int]
         if isinstance(error, OSError) and error.errno in _SYSTEM_ERRORS:
             raise machine_error("read", path, error) from error
         if content is None and not h5py.is_hdf5(path):
-            text = f"{path} is not an HDF5 file, or its beginning is damaged{apparent_kind(path)}"
-            raise DatasetError(text) from error
+            raise DatasetError(
+                f"{path} is not an HDF5 file, or its beginning is damaged{apparent_kind(path)}"
+            ) from error
         raise DatasetError(f"{path} is damaged or cut off: {error}") from error
 
 
