@@ -10,3 +10,12 @@ Array = NDArray[np.float64]
 
 AnyArray = NDArray[Any]
 """Numbers of a type that the caller chooses, such as float32 of stored rows."""
+
+Mask = NDArray[np.bool_]
+"""Truth values, one for each entry."""
+
+Integers = NDArray[np.int64]
+"""Numbers of samples, plans or entries."""
+
+Columns = dict[str, AnyArray]
+"""The columns of N rows by their names, shape (N, width) or (N,) each."""

@@ -30,20 +30,11 @@ def add_options(parser: Parser) -> None:
         type=Path,
         help="plan file, .h5, or sampled trajectories",
     )
-    option(
-        "--problem",
-        metavar="NAME|FILE",
-        type=recipe_names.problem,
-        help="the problem of the plans; its tolerances are used",
-    )
+    text = "the problem of the plans; its tolerances are used"
+    option("--problem", metavar="NAME|FILE", type=recipe_names.problem, help=text)
     option("--extrapolate", action="store_true", help=EXTRAPOLATE)
-    option(
-        "--step",
-        metavar="S",
-        type=values.seconds,
-        default=1e-3,
-        help="time between two samples (default: 1ms, at most 10ms)",
-    )
+    text = "time between two samples (default: 1ms, at most 10ms)"
+    option("--step", metavar="S", type=values.seconds, default=1e-3, help=text)
     text = "largest tracking error of the joints, such as 2deg: position limits, clearances and the manifold hold"
     text += " within it; one number, or one per joint (default: exact tracking)"
     option("--tracking-error", metavar="E,...", type=values.tracking_errors, help=text)
@@ -64,12 +55,8 @@ def add_options(parser: Parser) -> None:
         type=values.plot_file,
         help="draw one plan or trajectory: .png, .pdf or .svg",
     )
-    option(
-        "--plan",
-        metavar="I",
-        type=values.natural,
-        help="plan or trajectory to draw; default the first that is not valid, or 0",
-    )
+    text = "plan or trajectory to draw; default the first that is not valid, or 0"
+    option("--plan", metavar="I", type=values.natural, help=text)
     add_json(parser)
 
 
@@ -133,6 +120,7 @@ def _draw(found: "Evaluation", picture: str, index: int | None) -> None:
     chosen = _chosen(found) if index is None else index
     problem, robot = open_problem(plans.problem)
     verdict = found.verdicts[chosen]
+    note = f"sample {plans.sample_id[chosen]}: {verdict}"
     plot_plan(
         problem,
         robot,
@@ -140,7 +128,7 @@ def _draw(found: "Evaluation", picture: str, index: int | None) -> None:
         chosen,
         picture,
         scene=plans.scene[chosen],
-        note=f"sample {plans.sample_id[chosen]}: {verdict}",
+        note=note,
         verdict=verdict,
     )
     print(f"drawn: plan {chosen} in {picture}", file=sys.stderr)

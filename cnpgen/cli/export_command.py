@@ -40,25 +40,16 @@ def add_options(parser: Parser) -> None:
         type=recipe_names.present_or_model,
         help="plan file, .h5",
     )
-    option(
-        "--to",
-        metavar="FORMAT",
-        required=True,
-        help="format: npz, csv, parquet, lerobot, mpd, ... ('cnpgen list exporters')",
-    )
+    text = "format: npz, csv, parquet, lerobot, mpd, ... ('cnpgen list exporters')"
+    option("--to", metavar="FORMAT", required=True, help=text)
     option(
         "--rate",
         metavar="HZ",
         type=values.hertz,
         help=f"samples per second (default: {DEFAULT_RATE_HZ:g})",
     )
-    option(
-        "-o",
-        "--out",
-        metavar="PATH",
-        type=Path,
-        help="file (npz) or folder to write; default: in the current folder, named after FILE and FORMAT",
-    )
+    text = "file (npz) or folder to write; default: in the current folder, named after FILE and FORMAT"
+    option("-o", "--out", metavar="PATH", type=Path, help=text)
     option(
         "--plan",
         metavar="I",
@@ -71,21 +62,10 @@ def add_options(parser: Parser) -> None:
         type=values.numbers,
         help="these samples' plans only, by sample_id; adds to --plan",
     )
-    option(
-        "--join",
-        metavar="NEXT",
-        type=Path,
-        action="append",
-        help="cut every plan of FILE and continue with the plan of the same number of this file; may be "
-        "repeated",
-    )
-    option(
-        "--at",
-        metavar="S",
-        type=values.seconds,
-        action="append",
-        help="time at which NEXT takes over: 330ms; once per --join (default: at the end)",
-    )
+    text = "cut every plan of FILE and continue with the plan of the same number of this file; may be repeated"
+    option("--join", metavar="NEXT", type=Path, action="append", help=text)
+    text = "time at which NEXT takes over: 330ms; once per --join (default: at the end)"
+    option("--at", metavar="S", type=values.seconds, action="append", help=text)
     option("--force", action="store_true", help="replace existing files")
 
 

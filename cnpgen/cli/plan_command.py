@@ -54,27 +54,12 @@ _OF_FILES = "{} is for files of boundary conditions or scenes"
 
 def add_options(parser: Parser) -> None:
     option = parser.add_argument
-    option(
-        "problems",
-        metavar="DIR|NAME|FILE",
-        type=recipe_names.problems,
-        help="a dataset's folder; a dataset or pipeline by name, or a recipe file; boundary conditions in "
-        "HDF5; or scenes",
-    )
-    option(
-        "--model",
-        metavar="NAME|FILE",
-        type=recipe_names.model,
-        help="a shipped model, or a model file (default for a shipped dataset by name: the model of this "
-        "name)",
-    )
-    option(
-        "-o",
-        "--out",
-        metavar="PLANS",
-        type=Path,
-        help="plan file to write, .h5 (default for a recipe: NAME-plans.h5)",
-    )
+    text = "a dataset's folder; a dataset or pipeline by name, or a recipe file; boundary conditions in HDF5; or scenes"
+    option("problems", metavar="DIR|NAME|FILE", type=recipe_names.problems, help=text)
+    text = "a shipped model, or a model file (default for a shipped dataset by name: the model of this name)"
+    option("--model", metavar="NAME|FILE", type=recipe_names.model, help=text)
+    text = "plan file to write, .h5 (default for a recipe: NAME-plans.h5)"
+    option("-o", "--out", metavar="PLANS", type=Path, help=text)
     add_selection(parser)
     option(
         "--other-rows",

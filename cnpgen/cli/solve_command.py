@@ -46,18 +46,10 @@ def add_options(parser: Parser) -> None:
     text += " or, with --robot, scenes"
     option("what", metavar="DIR|NAME|FILE", type=recipe_names.problems, help=text)
     add_selection(parser)
-    option(
-        "--problem",
-        metavar="NAME|FILE",
-        type=recipe_names.problem,
-        help="the problem of boundary conditions in HDF5; its tolerances are used",
-    )
-    option(
-        "--extrapolate",
-        action="store_true",
-        default=None,
-        help=f"{EXTRAPOLATE}, in HDF5",
-    )
+    text = "the problem of boundary conditions in HDF5; its tolerances are used"
+    option("--problem", metavar="NAME|FILE", type=recipe_names.problem, help=text)
+    text = f"{EXTRAPOLATE}, in HDF5"
+    option("--extrapolate", action="store_true", default=None, help=text)
     _add_scenes(parser)
     option(
         "-o",
@@ -66,13 +58,8 @@ def add_options(parser: Parser) -> None:
         type=Path,
         help="output file (default: DIR-plans.h5 or NAME-plans.h5)",
     )
-    option(
-        "--time-limit",
-        metavar="SECONDS",
-        type=values.time_limit,
-        help="time per problem, such as 100ms, after which the first valid plan ends the search; 0: a "
-        "first plan quickly",
-    )
+    text = "time per problem, such as 100ms, after which the first valid plan ends the search; 0: a first plan quickly"
+    option("--time-limit", metavar="SECONDS", type=values.time_limit, help=text)
     option("--allow-large-angles", action="store_true", help=LARGE_ANGLES)
     parser.epilog = f"{parser.epilog or ''}\n"
     add_refine_options(parser)
@@ -81,45 +68,23 @@ def add_options(parser: Parser) -> None:
 def _add_scenes(parser: Parser) -> None:
     """Add the options of scenes."""
     option = parser.add_argument
-    option(
-        "--robot",
-        metavar="NAME|FILE",
-        type=recipe_names.problem,
-        help="solve scenes with this problem of a robot, such as panda",
-    )
+    text = "solve scenes with this problem of a robot, such as panda"
+    option("--robot", metavar="NAME|FILE", type=recipe_names.problem, help=text)
     option("--allow-unused", metavar="KEY", action="append", help=ALLOW_UNUSED)
-    option(
-        "--payload",
-        metavar="KG",
-        type=values.kilograms,
-        help="mass of objects that scenes attach with weight 0, such as 2kg",
+    text = "mass of objects that scenes attach with weight 0, such as 2kg"
+    option("--payload", metavar="KG", type=values.kilograms, help=text)
+    text = (
+        "present positions of the planned joints, for scenes whose start state is empty"
     )
-    option(
-        "--start",
-        metavar="Q1,Q2,...",
-        type=values.positions,
-        help="present positions of the planned joints, for scenes whose start state is empty",
+    option("--start", metavar="Q1,Q2,...", type=values.positions, help=text)
+    text = "plan file with a plan for each scene, before obstacles or ends moved a little: initial guesses"
+    option("--initial-plans", metavar="FILE", type=Path, help=text)
+    text = (
+        "end motions in scenes with zero acceleration, so that another one may follow"
     )
-    option(
-        "--initial-plans",
-        metavar="FILE",
-        type=Path,
-        help="plan file with a plan for each scene, before obstacles or ends moved a little: initial "
-        "guesses",
-    )
-    option(
-        "--smooth-stop",
-        action="store_true",
-        default=None,
-        help="end motions in scenes with zero acceleration, so that another one may follow",
-    )
-    option(
-        "--packages",
-        metavar="FOLDER",
-        type=Path,
-        action="append",
-        help="folder with the packages of mesh files of scenes; may be repeated",
-    )
+    option("--smooth-stop", action="store_true", default=None, help=text)
+    text = "folder with the packages of mesh files of scenes; may be repeated"
+    option("--packages", metavar="FOLDER", type=Path, action="append", help=text)
 
 
 def run(arguments: argparse.Namespace) -> int:

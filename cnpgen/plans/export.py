@@ -108,10 +108,8 @@ def export_plans(
     """
     exporter = load_exporter(to)
     if not 0 < rate <= MAX_RATE_HZ:
-        raise UsageError(
-            f"the rate must be above 0 and at most {MAX_RATE_HZ:g} Hz, got {rate}",
-            concerns="rate",
-        )
+        text = f"the rate must be above 0 and at most {MAX_RATE_HZ:g} Hz, got {rate}"
+        raise UsageError(text, concerns="rate")
     chosen = _chosen(plans, only)
     out = Path(out)
     refused = _refused(plans, rate, chosen)
@@ -122,10 +120,8 @@ def export_plans(
             f"none of the {len(chosen)} plans can be exported{': ' if reasons else ''}{reasons}"
         )
     if not exporter.single_file and out.exists() and not out.is_dir():
-        raise UsageError(
-            f"{out} is a file, but {to!r} makes one file per plan: give a folder",
-            concerns="out",
-        )
+        text = f"{out} is a file, but {to!r} makes one file per plan: give a folder"
+        raise UsageError(text, concerns="out")
     sampled = _sampled(plans, rate, kept, exporter.ticks_per_s)
     has_drives = "drive" in plans.problem.content
     drive = open_problem(plans.problem)[1].drive if has_drives else None

@@ -90,12 +90,8 @@ def regenerate_blocks(
             same, problem = _compare(stored, again)
             identical += same
             if problem:
-                findings.append(
-                    Finding(
-                        task.file,
-                        f"block {block} made again from the seed: {problem}{_explanation(spec, recipe)}",
-                    )
-                )
+                text = f"block {block} made again from the seed: {problem}{_explanation(spec, recipe)}"
+                findings.append(Finding(task.file, text))
     return Regeneration(len(chosen), len(blocks), identical, tuple(findings))
 
 
@@ -331,16 +327,11 @@ def check_recipe(spec: DatasetSpec) -> list[Finding]:
         )
     except (KeyError, TypeError, AttributeError):
         return [Finding(SPECIFICATION, "its recipe cannot be read", hint=REPLACE_HINT)]
+    text = f"its recipe has the sha256 {digest}, not the recorded {spec.recipe_sha256}"
     return (
         []
         if digest == spec.recipe_sha256
-        else [
-            Finding(
-                SPECIFICATION,
-                f"its recipe has the sha256 {digest}, not the recorded {spec.recipe_sha256}",
-                hint=REPLACE_HINT,
-            )
-        ]
+        else [Finding(SPECIFICATION, text, hint=REPLACE_HINT)]
     )
 
 
@@ -356,14 +347,6 @@ def check_statistics(folder: Path, spec: DatasetSpec) -> list[Finding]:
         # Missing or damaged files are findings already.
         return []
     different = [key for key in expected if document.get(key) != expected[key]]
-    return (
-        [
-            Finding(
-                STATS,
-                f"is not the summary of the records of the shards: {', '.join(different)} differ",
-                hint=f"delete {STATS} and {RERUN_HINT}: it writes the file again",
-            )
-        ]
-        if different
-        else []
-    )
+    text = f"is not the summary of the records of the shards: {', '.join(different)} differ"
+    hint = f"delete {STATS} and {RERUN_HINT}: it writes the file again"
+    return [Finding(STATS, text, hint=hint)] if different else []

@@ -176,9 +176,8 @@ def run_benchmark(
     problems, prefix = loaded.problems(n)
     if chosen.environment is not None:
         check_challenge(*open_problem(problems.problem))
-    limit = float(chosen.time_limit)
-    seed = int(chosen.seed)
-    setting = Setting(problems.problem, loaded.model, limit, seed)
+    seed = chosen.seed
+    setting = Setting(problems.problem, loaded.model, chosen.time_limit, seed)
     place = ResultsFolder(Path(folder), loaded, setting)
     names = {*place.planners(delete_others=force), *planners}
     _check_reference(chosen.reference, names)
