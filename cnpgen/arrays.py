@@ -17,5 +17,8 @@ Mask = NDArray[np.bool_]
 Integers = NDArray[np.int64]
 """Numbers of samples, plans or entries."""
 
+Indices = NDArray[np.intp]
+"""Positions in an array."""
+
 Columns = dict[str, AnyArray]
 """The columns of N rows by their names, shape (N, width) or (N,) each."""

@@ -12,7 +12,7 @@ import sys
 import textwrap
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from cnpgen.cli import recipe_names, values
 from cnpgen.cli.interruption import resumable
@@ -28,6 +28,7 @@ from cnpgen.cli.parser import (
 from cnpgen.cli.terminal import Meter
 from cnpgen.cli.verdict_text import checksum_text
 from cnpgen.errors import UsageError, counted
+from cnpgen.schema.tables import JsonObject
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -208,7 +209,7 @@ def _identity(plans: "Plans", options: "RefineOptions") -> list[str]:
 
 
 def _print_result(
-    arguments: argparse.Namespace, out: Path, facts: dict[str, Any], times: "Times"
+    arguments: argparse.Namespace, out: Path, facts: JsonObject, times: "Times"
 ) -> None:
     """Print a summary on stderr, and the file or JSON on stdout."""
     if not arguments.quiet:
@@ -282,7 +283,7 @@ def check_place(out: Path) -> None:
 
 
 def _explain(
-    facts: dict[str, Any], found: "Refinement | SolvedScenes", meter: Meter
+    facts: JsonObject, found: "Refinement | SolvedScenes", meter: Meter
 ) -> None:
     """Add proofs of infeasibility to the results of invalid plans, unless all have one."""
     from cnpgen.refine.proof.explain import explain_plans
@@ -296,7 +297,7 @@ def _explain(
         meter(1)
 
 
-def _summary(facts: dict[str, Any], times: "Times", *, listed: int) -> list[str]:
+def _summary(facts: JsonObject, times: "Times", *, listed: int) -> list[str]:
     """Summarize the refined plans."""
     from cnpgen.refine.task import Outcome
 
@@ -322,7 +323,7 @@ def _summary(facts: dict[str, Any], times: "Times", *, listed: int) -> list[str]
     return lines
 
 
-def _failure_text(failure: dict[str, Any]) -> str:
+def _failure_text(failure: JsonObject) -> str:
     """Describe why one plan is invalid, with the proof of its problem if requested."""
     why = (
         f"{failure['finding']}: {failure['explanation']}"

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 from cnpgen.cli.terminal import table
 from cnpgen.errors import counted
+from cnpgen.schema.tables import JsonObject
 
 if TYPE_CHECKING:
     from cnpgen.judges.plans import Verdict
@@ -86,7 +87,7 @@ def checksum_text(plans: "Plans") -> str:
     )
 
 
-def _reasons(found: "Evaluation", summary: dict[str, Any]) -> list[tuple[str, ...]]:
+def _reasons(found: "Evaluation", summary: JsonObject) -> list[tuple[str, ...]]:
     """Say why plans are not valid, the most frequent reason first."""
     rows: list[tuple[str, ...]] = [("not valid because", "plans", "the worst of them")]
     for reason, number in summary["reasons"].items():
@@ -130,7 +131,7 @@ def _shown(found: "Evaluation") -> list[str]:
     ]
 
 
-def _figures(summary: dict[str, Any], names: Sequence[str]) -> list[tuple[str, ...]]:
+def _figures(summary: JsonObject, names: Sequence[str]) -> list[tuple[str, ...]]:
     """Lay out the metrics: of valid plans, of those valid by the paper's rules, and of all."""
     columns = [("metrics_of_valid", name) for name in ("mean", "median", "p95", "max")]
     columns += [("metrics_of_paper_valid", "mean"), ("metrics_of_all", "mean")]
@@ -155,7 +156,7 @@ def _figures(summary: dict[str, Any], names: Sequence[str]) -> list[tuple[str, .
     return rows
 
 
-def _margins(summary: dict[str, Any]) -> list[tuple[str, ...]]:
+def _margins(summary: JsonObject) -> list[tuple[str, ...]]:
     """Format per condition the number of violating plans and the plan with the smallest margin."""
     rows = [margin_head("condition", "violated by", item="plan")]
     for name, worst in summary["conditions"].items():

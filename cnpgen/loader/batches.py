@@ -7,8 +7,8 @@ from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from cnpgen.arrays import AnyArray
 from cnpgen.errors import DatasetError, UsageError
 from cnpgen.loader.batch import Batch
 from cnpgen.loader.row_format import RowFormat
@@ -18,7 +18,7 @@ from cnpgen.schema.arguments import flag, integer
 
 LOADER_STATE_FORMAT = "cnpgen-loader-state"
 LOADER_STATE_VERSION = 1  # also raised if the computation of the order changes
-Observe = Callable[[Batch], Mapping[str, NDArray[Any]]]
+Observe = Callable[[Batch], Mapping[str, AnyArray]]
 
 
 @dataclass(frozen=True, kw_only=True)

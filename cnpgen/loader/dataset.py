@@ -14,8 +14,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, DTypeLike, NDArray
+from numpy.typing import ArrayLike, DTypeLike
 
+from cnpgen.arrays import AnyArray
 from cnpgen.errors import DatasetError, MissingExtraError, UsageError, lacks
 from cnpgen.loader.batch import observer_of
 from cnpgen.loader.batch_options import BatchOptions
@@ -329,7 +330,7 @@ class Dataset:
 
 
 def make_frame(
-    rows: Mapping[str, NDArray[Any]], fields: Sequence[Field], *, library: str | None
+    rows: Mapping[str, AnyArray], fields: Sequence[Field], *, library: str | None
 ) -> Any:
     """Convert rows, of shape (rows, width) or (rows,) each, to a ``DataFrame`` with columns in the order of the fields.
 

@@ -29,6 +29,7 @@ from cnpgen.schema.arguments import concerning
 from cnpgen.schema.catalogue import load_recipe, read_kind, reference
 from cnpgen.schema.keys import NAME, RecipeLocation, field
 from cnpgen.schema.parsing import Reader, parse, stored_values
+from cnpgen.schema.tables import JsonObject
 from cnpgen.schema.texts import read_own, utf8_text
 from cnpgen.schema.toml import is_kind, read_table
 from cnpgen.store.dataset_spec import GENERATOR_REVISION, DatasetSpec
@@ -168,7 +169,7 @@ def as_dataset_recipe(recipe: object) -> DatasetRecipe:
 
 
 def restore_dataset_recipe(
-    content: dict[str, Any], urdf: str, folder: Path
+    content: JsonObject, urdf: str, folder: Path
 ) -> DatasetRecipe:
     """Rebuild a recipe from its resolved form in a specification.
 

@@ -9,9 +9,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from cnpgen.arrays import Array
+from cnpgen.arrays import Array, Mask
 from cnpgen.errors import UsageError, counted
 from cnpgen.machine.engine import Engine
 from cnpgen.machine.times import NO_TIME, Times
@@ -60,6 +59,7 @@ from cnpgen.robots.scene import Scene
 from cnpgen.robots.solid import place_obstacles
 from cnpgen.schema.argument_types import check_fields, checked_arguments
 from cnpgen.schema.old_keywords import with_old_keywords
+from cnpgen.schema.tables import JsonObject
 from cnpgen.store.dataset_spec import StoredProblem
 from cnpgen.world.pose_ik import PoseKinematics
 
@@ -117,11 +117,11 @@ class SolvedScenes:
         return f"<{len(self.scenes)} scenes of {self.plans.problem.name!r}, {int(self.valid.sum())} solved>"
 
     @property
-    def valid(self) -> NDArray[np.bool_]:
+    def valid(self) -> Mask:
         """Mask of the scenes with a plan that the independent verdict accepts, shape (N,)."""
         return np.array([result.valid for result in self.results], bool)
 
-    def summary(self) -> dict[str, Any]:
+    def summary(self) -> JsonObject:
         """Return a summary for JSON.
 
         Unsolved scenes have a name, a reason and an explanation.

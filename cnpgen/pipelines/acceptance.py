@@ -10,9 +10,8 @@ from collections.abc import Callable, Collection
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from cnpgen.arrays import Array
+from cnpgen.arrays import Array, Mask
 from cnpgen.kernels.symbolic.linalg import Scalar, Vec, dot, subtract, symbols
 from cnpgen.kernels.symbolic.symbolic_state import SymbolicState
 from cnpgen.pipelines.stages.collision import candidate_poses
@@ -33,7 +32,6 @@ from cnpgen.robots.scene import scene_capacity
 from cnpgen.world.path import PathWorld
 from cnpgen.world.world import World
 
-Mask = NDArray[np.bool_]
 States = tuple[Array, Array, Array]
 
 Decide = Callable[[States, Array, Mask, CandidateBatch | None], Mask]

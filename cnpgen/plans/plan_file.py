@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from cnpgen.arrays import AnyArray, Columns, Integers
 from cnpgen.errors import DatasetError, RecipeError, UsageError, nearest
 from cnpgen.plans.format import (
     ATTRIBUTES,
@@ -127,7 +128,7 @@ def errors_of_file(path: Path) -> Iterator[None]:
         ) from error
 
 
-def _columns(path: Path, file: Hdf5) -> dict[str, NDArray[Any]]:
+def _columns(path: Path, file: Hdf5) -> Columns:
     """Read the datasets of a file."""
     columns = {name: _read(path, name, item) for name, item in file.columns().items()}
     missing = [
@@ -145,7 +146,7 @@ def _columns(path: Path, file: Hdf5) -> dict[str, NDArray[Any]]:
     return columns
 
 
-def _read(path: Path, name: str, dataset: Column) -> NDArray[Any]:
+def _read(path: Path, name: str, dataset: Column) -> AnyArray:
     """Read a dataset in its required type."""
     what, kinds = (
         ("integers", "iu")
@@ -212,7 +213,7 @@ def agreed_problem(
     *,
     content: str,
     command: str,
-    parameters: NDArray[Any] | None = None,
+    parameters: AnyArray | None = None,
 ) -> ProblemRecord:
     """Return the problem of a file: the required one if it is consistent, or the file's own.
 
@@ -325,7 +326,7 @@ def _stored_record(path: Path, attributes: Mapping[str, Any]) -> ProblemRecord:
 def _assembled(
     path: Path,
     record: ProblemRecord,
-    columns: dict[str, NDArray[Any]],
+    columns: Columns,
     attributes: Mapping[str, Any],
 ) -> Plans:
     """Build the plans from the contents of the file."""
@@ -357,7 +358,7 @@ def _assembled(
 
 
 def _statuses(
-    path: Path, stored: NDArray[np.int64], attributes: Mapping[str, Any]
+    path: Path, stored: Integers, attributes: Mapping[str, Any]
 ) -> NDArray[np.uint8]:
     """Translate status values by their names in the file.
 
@@ -433,7 +434,7 @@ def check_replaceable(path: Path) -> None:
         )
 
 
-def _datasets(plans: Plans) -> dict[str, NDArray[Any]]:
+def _datasets(plans: Plans) -> Columns:
     """Return the stored datasets, in order and in their stored types."""
     # Columns are sorted: the order of a mapping does not change the bytes.
     floats = plans.boundary.arrays() | dict(sorted(plans.columns.items()))
@@ -442,7 +443,7 @@ def _datasets(plans: Plans) -> dict[str, NDArray[Any]]:
         "rate_control_points": plans.rate_control_points,
     }
     floats["duration"] = plans.duration
-    stored: dict[str, NDArray[Any]] = {
+    stored: Columns = {
         name: np.ascontiguousarray(values, "<f8") for name, values in floats.items()
     }
     return stored | {

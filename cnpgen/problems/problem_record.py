@@ -36,6 +36,7 @@ from cnpgen.schema.argument_types import checked_arguments
 from cnpgen.schema.arguments import concerning, numbers
 from cnpgen.schema.keys import RecipeLocation
 from cnpgen.schema.parsing import parse, stored_values
+from cnpgen.schema.tables import JsonObject
 from cnpgen.store.dataset_spec import StoredProblem
 from cnpgen.store.files.cache_folder import temporary_folder
 from cnpgen.store.files.document_structure import (
@@ -91,14 +92,14 @@ class ProblemRecord(StoredProblem):
         return f"<ProblemRecord of {self.name!r}: {len(self.joint_names)} joints>"
 
     @cached_property
-    def content(self) -> dict[str, Any]:
+    def content(self) -> JsonObject:
         """The resolved problem, as ``cnpgen.problems.problem.resolved`` returns it.
 
         Raises:
             RecipeError: The text is not the JSON of a problem.
         """
         try:
-            content: dict[str, Any] = parse_json(self.recipe)
+            content: JsonObject = parse_json(self.recipe)
             check_structure(content, _FORM)
         except ValueError as error:
             raise RecipeError(
@@ -380,7 +381,7 @@ def _robot_of(record: ProblemRecord) -> Robot:
         return load_robot(problem)
 
 
-def _comparable(record: ProblemRecord) -> dict[str, Any]:
+def _comparable(record: ProblemRecord) -> JsonObject:
     """Reduce a resolved problem to the part that problems with comparable plans share."""
     kept = {
         key: value
@@ -394,7 +395,7 @@ def _comparable(record: ProblemRecord) -> dict[str, Any]:
     }
     # A difference of the URDF is one key, not the text.
     robot["urdf"] = hashlib.sha256(record.urdf.encode()).hexdigest()
-    constraints: dict[str, Any] = {}
+    constraints: JsonObject = {}
     counts = Counter[str]()
     for kind in kept["constraint"]:
         # Constraints of one kind are numbered in the order of the file.

@@ -1,7 +1,6 @@
 """Options of the refiner."""
 
 from dataclasses import asdict, dataclass
-from typing import Any
 
 from cnpgen.errors import UsageError
 from cnpgen.problems.objectives import read_objective
@@ -14,6 +13,7 @@ from cnpgen.schema.arguments import (
     number,
     positive,
 )
+from cnpgen.schema.tables import JsonObject
 
 MAX_STAY_WITHIN = 1.0  # rad or m
 
@@ -94,7 +94,7 @@ class RefineOptions:
                     argument=name,
                 )
 
-    def document(self) -> dict[str, Any]:
+    def document(self) -> JsonObject:
         """Return the options for JSON, without a deadline, a distance or a limit of None."""
         optional = {"deadline", "stay_within", "time_limit"}
         return {

@@ -1,13 +1,14 @@
 """Obstacles of a problem file."""
 
 import math
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 from cnpgen.robots.parameter_ranges import optional_key
 from cnpgen.robots.shape.hull import MAX_COORDINATE_M, check_solid
 from cnpgen.robots.shape.inline import corners_of, is_inline
 from cnpgen.schema.keys import Range, field, keys
+from cnpgen.schema.tables import NamedErrors
 from cnpgen.schema.units import PLAUSIBLE_MAX, suggested_unit
 
 _KEYS = {  # kind -> keys of pose and size; those of _OPTIONAL may be omitted
@@ -80,11 +81,11 @@ class Obstacle:
         "scale factors of the mesh along x, y and z", default=_OPTIONAL["scale"]
     )
 
-    def validate(self) -> Iterator[tuple[str, str]]:
+    def validate(self) -> NamedErrors:
         """Yield (key, error) pairs."""
         yield from self._mistakes_upright() if self.upright else self._mistakes_posed()
 
-    def value_errors(self) -> Iterator[tuple[str, str]]:
+    def value_errors(self) -> NamedErrors:
         """Yield (key, error) pairs of an obstacle that Python has built: its kind, missing keys, and numbers."""
         if self.kind not in _KEYS:
             yield "kind", f"must be one of {', '.join(_KEYS)}, got {self.kind!r}"
@@ -126,7 +127,7 @@ class Obstacle:
         """Whether its axes differ from the world's axes."""
         return self.rotation != _OPTIONAL["rotation"]
 
-    def _mistakes_upright(self) -> Iterator[tuple[str, str]]:
+    def _mistakes_upright(self) -> NamedErrors:
         if self.top is None and not self.below:
             yield (
                 "top",
@@ -154,7 +155,7 @@ class Obstacle:
                 f"an upright box has {_listed(_UPRIGHT)}: leave this out, or give a box with a pose",
             )
 
-    def _mistakes_posed(self) -> Iterator[tuple[str, str]]:
+    def _mistakes_posed(self) -> NamedErrors:
         known = _KEYS[self.kind]
         needed = [key for key in known if key not in _OPTIONAL]
         instead = (

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -10,6 +10,7 @@ import numpy as np
 
 from cnpgen.robots.parameter_ranges import PAYLOAD_CENTRE, optional_key
 from cnpgen.schema.keys import PerJoint, Range, field
+from cnpgen.schema.tables import NamedErrors
 
 GEOMETRIES = ("urdf", "paper-capsules")
 SOURCE = r"^(vendor|urdf|stated|guess): \S.*"  # of a limit: its basis, then a text
@@ -94,7 +95,7 @@ class RobotSpec:
         default=(),
     )
 
-    def validate(self) -> Iterator[tuple[str, str]]:
+    def validate(self) -> NamedErrors:
         """Yield (key, error) pairs."""
         twice = sorted({name for name in self.joints if self.joints.count(name) > 1})
         if twice:
@@ -244,7 +245,7 @@ class Payload:
         default=(),
     )
 
-    def validate(self) -> Iterator[tuple[str, str]]:
+    def validate(self) -> NamedErrors:
         """Yield (key, error) pairs."""
         if self.inertia is not None and self.size is not None and not self.touch_links:
             yield (

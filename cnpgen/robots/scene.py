@@ -10,9 +10,8 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from cnpgen.arrays import Array
+from cnpgen.arrays import AnyArray, Array
 from cnpgen.errors import UsageError, counted
 from cnpgen.robots.obstacle import Obstacle
 from cnpgen.robots.shape.hull import MAX_COORDINATE_M
@@ -67,7 +66,7 @@ class Scene:
     def __len__(self) -> int:
         return len(self.poses)
 
-    def __getitem__(self, index: int | slice | Sequence[int] | NDArray[Any]) -> Scene:
+    def __getitem__(self, index: int | slice | Sequence[int] | AnyArray) -> Scene:
         """Select samples; an integer selects one sample and keeps the first axis."""
         rows: Any = index
         if isinstance(index, int):

@@ -4,11 +4,11 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from cnpgen.errors import DatasetError
+from cnpgen.schema.tables import JsonObject
 from cnpgen.store.checked_shard import Shard, read_rows
 from cnpgen.store.dataset_spec import (
     DatasetSpec,
@@ -122,7 +122,7 @@ def _reason(error: DatasetError, path: Path) -> str:
 
 def _check_manifest(
     folder: Path, spec: DatasetSpec
-) -> tuple[list[Finding], dict[str, Any]]:
+) -> tuple[list[Finding], JsonObject]:
     """Check the manifest and the files it lists.
 
     Return also the manifest, empty if it is not valid.
@@ -190,7 +190,7 @@ def check_shard(
     folder: Path,
     spec: DatasetSpec,
     task: ShardTask,
-    entry: dict[str, Any] | None = None,
+    entry: JsonObject | None = None,
 ) -> list[Finding]:
     """Check one shard and its sidecar.
 
@@ -233,7 +233,7 @@ def _is_of_another_spec(path: Path, spec: DatasetSpec) -> bool:
 
 
 def _check_sidecar(
-    folder: Path, spec: DatasetSpec, task: ShardTask, entry: dict[str, Any] | None
+    folder: Path, spec: DatasetSpec, task: ShardTask, entry: JsonObject | None
 ) -> tuple[list[Finding], tuple[str, int] | None]:
     """Check a sidecar; return also the recorded sha256 and size of the shard, or None if neither record is valid."""
     expected = None if entry is None else (entry["sha256"], entry["bytes"])

@@ -15,7 +15,8 @@ from pathlib import Path
 from typing import Any
 
 from cnpgen.errors import DatasetError, UsageError, nearest
-from cnpgen.store.field import Field
+from cnpgen.schema.tables import JsonObject
+from cnpgen.store.field import Field, Fields
 from cnpgen.store.files.atomic import read_file
 from cnpgen.store.files.document_structure import (
     ANY_KEY,
@@ -178,7 +179,7 @@ class DatasetSpec:
     backend: str
     generator: str = "numpy SFC64 seeded by SeedSequence"
     revision: int = GENERATOR_REVISION
-    fields: tuple[Field, ...]
+    fields: Fields
     robot: Mapping[str, Any] = field(default_factory=dict)
     versions: Mapping[str, str] = field(default_factory=dict)
     previous_splits: tuple[Mapping[str, int], ...] = ()
@@ -262,14 +263,14 @@ class DatasetSpec:
         )
 
     @property
-    def stages(self) -> list[dict[str, Any]]:
+    def stages(self) -> list[JsonObject]:
         """The resolved stages that draw the samples.
 
         Raises:
             DatasetError: The specification does not contain its stages.
         """
         self._require({"pipeline": {"stage": [{"use": TEXT}]}}, "the stages")
-        stages: list[dict[str, Any]] = self.recipe["pipeline"]["stage"]
+        stages: list[JsonObject] = self.recipe["pipeline"]["stage"]
         return stages
 
     def _require(self, structure: Structure, content: str) -> None:
@@ -285,7 +286,7 @@ class DatasetSpec:
             ) from error
 
     @cached_property
-    def scene_fields(self) -> tuple[Field, ...]:
+    def scene_fields(self) -> Fields:
         """The fields of the scene of each sample, flattened.
 
         They are stored once for each scene.
@@ -429,7 +430,7 @@ def shard_attributes(spec: DatasetSpec, task: ShardTask) -> dict[str, str | int]
     }
 
 
-def to_json(spec: DatasetSpec) -> dict[str, Any]:
+def to_json(spec: DatasetSpec) -> JsonObject:
     """Return a specification as a JSON-able dict."""
     converted = {
         # JSON numbers of other readers have 53 bits

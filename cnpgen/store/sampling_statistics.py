@@ -9,9 +9,10 @@ from functools import reduce
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from cnpgen.arrays import Integers
 from cnpgen.errors import DatasetError
+from cnpgen.schema.tables import JsonObject
 from cnpgen.store.files.document_structure import ANY_KEY, NUMBER, TEXT, WHOLE
 from cnpgen.store.files.documents import plain
 
@@ -29,8 +30,8 @@ class DensityMap:
 
     x: tuple[float, float]
     y: tuple[float, float]
-    candidates: NDArray[np.int64]
-    accepted: NDArray[np.int64]
+    candidates: Integers
+    accepted: Integers
 
     def merge(self, other: DensityMap) -> DensityMap:
         """Add the counts of two maps of the same grid.
@@ -108,7 +109,7 @@ class SamplingStatistics:
             verification=worst,
         )
 
-    def yield_json(self) -> dict[str, Any]:
+    def yield_json(self) -> JsonObject:
         """Return tried, accepted and rejections as a JSON-able dict."""
         return {
             "tried": self.tried,
@@ -116,7 +117,7 @@ class SamplingStatistics:
             "rejections": dict(self.rejections),
         }
 
-    def to_json(self) -> dict[str, Any]:
+    def to_json(self) -> JsonObject:
         """Return everything as a JSON-able dict."""
         return {
             **self.yield_json(),
@@ -142,7 +143,7 @@ def _merged_order(first: Sequence[str], second: Sequence[str]) -> list[str]:
     return merged
 
 
-def densities_to_json(densities: Mapping[str, DensityMap]) -> dict[str, Any]:
+def densities_to_json(densities: Mapping[str, DensityMap]) -> JsonObject:
     """Return density maps as a JSON-able dict."""
     return {name: plain(vars(item)) for name, item in densities.items()}
 

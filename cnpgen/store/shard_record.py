@@ -5,9 +5,9 @@ from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Any
 
-from numpy.typing import NDArray
-
+from cnpgen.arrays import AnyArray
 from cnpgen.errors import CnpgenError, DatasetError
+from cnpgen.schema.tables import JsonObject
 from cnpgen.store.dataset_spec import DatasetSpec, ShardTask, shard_attributes, shards
 from cnpgen.store.files.atomic import file_sha256
 from cnpgen.store.files.document_structure import (
@@ -83,7 +83,7 @@ _PLAIN = tuple(
 )
 
 
-def record_to_json(record: ShardRecord) -> dict[str, Any]:
+def record_to_json(record: ShardRecord) -> JsonObject:
     """Return a record as a JSON-able dict."""
     return {
         **{name: getattr(record, name) for name in _PLAIN},
@@ -151,7 +151,7 @@ def commit_shard(
     spec: DatasetSpec,
     task: ShardTask,
     *,
-    columns: Mapping[str, NDArray[Any]],
+    columns: Mapping[str, AnyArray],
     sampling: SamplingStatistics,
     scenes: SceneTable | None = None,
     started: str = "",
@@ -197,7 +197,7 @@ def _write(
     folder: Path,
     spec: DatasetSpec,
     task: ShardTask,
-    columns: Mapping[str, NDArray[Any]],
+    columns: Mapping[str, AnyArray],
     scenes: SceneTable | None,
 ) -> int:
     """Check the scenes, write a shard, and return its number of bytes."""

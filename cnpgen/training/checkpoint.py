@@ -9,10 +9,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from cnpgen.arrays import AnyArray
+from cnpgen.arrays import AnyArray, Mask
 from cnpgen.errors import DatasetError, UsageError
+from cnpgen.schema.tables import JsonObject
 from cnpgen.store.files.checksum_file import (
     Content,
     read_with_checksum,
@@ -62,7 +62,7 @@ class Sums:
         Plans without a finite loss are counted and omitted.
         """
         # Plans whose loss is not finite are counted, not averaged.
-        finite: NDArray[np.bool_] = np.asarray(np.isfinite(terms).all(axis=1))
+        finite: Mask = np.asarray(np.isfinite(terms).all(axis=1))
         if finite.any():
             self.terms += terms[finite].mean(axis=0, dtype=np.float64)
         self.lost += int(len(finite) - finite.sum())
@@ -184,7 +184,7 @@ class Checkpoints:
         self.path = path
         # In the form in which it is read back, so that equal identities compare as
         # equal.
-        self.identity: dict[str, Any] = json.loads(json.dumps(identity))
+        self.identity: JsonObject = json.loads(json.dumps(identity))
         self._next = time.monotonic() + MIN_INTERVAL_S
 
     def load(self, *, discard: bool = False) -> State | None:

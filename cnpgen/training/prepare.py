@@ -7,11 +7,10 @@ import math
 import time
 from dataclasses import asdict, replace
 from functools import partial
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from cnpgen.arrays import AnyArray
 from cnpgen.errors import UsageError
 from cnpgen.losses.margins import Margins, suggested_margins
 from cnpgen.losses.metric import Metric, suggested_weights
@@ -35,6 +34,7 @@ from cnpgen.planner.network.features import (
 from cnpgen.planner.tasks import Tasks
 from cnpgen.plans.evaluate import evaluate_plans
 from cnpgen.schema.arguments import check_memory
+from cnpgen.schema.tables import JsonObject
 from cnpgen.store.files.documents import plain
 from cnpgen.store.scene_table import OBSTACLE_POSES
 from cnpgen.training.checkpoint import State, start_state
@@ -195,7 +195,7 @@ def _initial_features(
     )
 
 
-def identity(source: TrainingData, settings: TrainingSettings) -> dict[str, Any]:
+def identity(source: TrainingData, settings: TrainingSettings) -> JsonObject:
     """Return the identity of a run without its length; JSON-able."""
     return {
         "cnpgen": __version__,
@@ -210,7 +210,7 @@ def _record(
     command: str,
     rows: Rows,
     initial_model: Model | None,
-) -> dict[str, Any]:
+) -> JsonObject:
     """Return what a model's file states of its run; JSON-able."""
     return {
         "command": command,
@@ -221,7 +221,7 @@ def _record(
 
 
 def input_ranges(
-    inputs: NDArray[Any], initial_model: Model | None = None
+    inputs: AnyArray, initial_model: Model | None = None
 ) -> dict[str, list[float]]:
     """Return the smallest and largest inputs of the network in the training rows, shape (N, F), with eight digits.
 
@@ -291,7 +291,7 @@ def _check_initial_model(
 
 def _parameter_definition(
     architecture: Architecture, config: ModelConfig, zero: tuple[str, ...]
-) -> dict[str, Any]:
+) -> JsonObject:
     """Return the values that must agree for parameters to be interchangeable."""
     outputs = {
         "path_scale": config.path_scale,
@@ -406,7 +406,7 @@ def validate(
     model: Model,
     *,
     workers: int | None = 1,
-) -> dict[str, Any]:
+) -> JsonObject:
     """Plan for N validation rows and judge the plans in some processes.
 
     Returns:

@@ -22,6 +22,7 @@ from cnpgen.problems.problem_record import (
 from cnpgen.schema.argument_types import checked_arguments
 from cnpgen.schema.arguments import concerning, integer
 from cnpgen.schema.old_keywords import with_old_keywords
+from cnpgen.schema.tables import JsonObject
 from cnpgen.store.files.atomic import check_writable, file_sha256
 from cnpgen.store.files.documents import differences, plain
 from cnpgen.store.files.file_lock import output_lock
@@ -117,7 +118,7 @@ def train_model(
     settings = settings or TrainingSettings()
     lengths = {"steps": steps, "epochs": chosen.epochs, "cpu_seconds": cpu_seconds}
     stated = {name: value for name, value in lengths.items() if value is not None}
-    passed: dict[str, Any] = stated or {"cpu_seconds": DEFAULT_CPU_TIME_S}
+    passed: JsonObject = stated or {"cpu_seconds": DEFAULT_CPU_TIME_S}
     check_rows = integer("check_rows", check_rows, least=1)
     check_out(out)
     remove_temporary_files(out)
@@ -249,7 +250,7 @@ def _finished(path: Path, identity: Mapping[str, Any]) -> Trained:
     return Trained(model, path, model.training["score"], made=False)
 
 
-def _outcome(state: State, score: Mapping[str, Any]) -> dict[str, Any]:
+def _outcome(state: State, score: Mapping[str, Any]) -> JsonObject:
     """Return steps, times and score of a run, for the model's file."""
     return {
         "steps": state.adam.step,

@@ -14,6 +14,7 @@ from cnpgen.losses.plan_loss import PlanLoss
 from cnpgen.losses.quadrature import rotating_shift
 from cnpgen.machine.signals import signals_deferred
 from cnpgen.planner.model import Model
+from cnpgen.schema.tables import JsonObject
 from cnpgen.training.adam import learning_rate
 from cnpgen.training.checkpoint import Best, Checkpoints, State, Sums
 from cnpgen.training.log import TrainingLog
@@ -132,7 +133,7 @@ class Run:
             warm_up=settings.warm_up,
         )
 
-    def _due(self, state: State) -> list[dict[str, Any]]:
+    def _due(self, state: State) -> list[JsonObject]:
         """Return the records of the log that are due after this step."""
         step = state.adam.step
         records = []
@@ -142,7 +143,7 @@ class Run:
             records.append(self._check(state))
         return records
 
-    def _progress(self, state: State) -> dict[str, Any]:
+    def _progress(self, state: State) -> JsonObject:
         """Return the means of the terms since the last line."""
         sums = state.sums
         step = state.adam.step
@@ -163,7 +164,7 @@ class Run:
             "lost": sums.lost,
         }
 
-    def _means(self, state: State, sums: Sums) -> dict[str, Any]:
+    def _means(self, state: State, sums: Sums) -> JsonObject:
         means = sums.terms / sums.steps
         # The first term is that of the task.
         constraints = self.loss.terms[1:]
@@ -176,7 +177,7 @@ class Run:
             "budgets": dict(zip(constraints, self.loss.budgets.tolist(), strict=True)),
         }
 
-    def _check(self, state: State) -> dict[str, Any]:
+    def _check(self, state: State) -> JsonObject:
         """Validate the averaged parameters; keep them if they are the best so far."""
         started = time.process_time()
         step = state.adam.step

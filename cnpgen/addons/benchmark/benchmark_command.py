@@ -30,6 +30,7 @@ from cnpgen.cli.parser import (
 )
 from cnpgen.cli.terminal import Meter, table
 from cnpgen.errors import CnpgenError, UsageError
+from cnpgen.schema.tables import JsonObject
 
 if TYPE_CHECKING:
     from cnpgen.addons.benchmark.run_suite import Benchmark
@@ -259,7 +260,7 @@ def _run(arguments: argparse.Namespace, folder: Path) -> "Benchmark":
         )
 
 
-def _facts(found: "Benchmark", folder: Path) -> dict[str, Any]:
+def _facts(found: "Benchmark", folder: Path) -> JsonObject:
     """Return the results of all planners for JSON."""
     from cnpgen.addons.benchmark.hypothesis_tests import reference_planner
     from cnpgen.addons.benchmark.results_file import RESULTS_FORMAT, RESULTS_VERSION

@@ -13,6 +13,7 @@ import numpy as np
 
 from cnpgen.addons.benchmark.simulator.executed import PLANE_TOLERANCE_M, succeeded
 from cnpgen.arrays import Array
+from cnpgen.schema.tables import JsonObject
 
 FLAGS = {  # of a row; those from "at the goal, executed" on need an execution
     "planned": "a plan was found",
@@ -119,7 +120,7 @@ def summarize_results(
     *,
     reference: str | None = None,
     plane_tolerance: float = PLANE_TOLERANCE_M,
-) -> dict[str, dict[str, dict[str, dict[str, Any]]]]:
+) -> dict[str, dict[str, dict[str, JsonObject]]]:
     """Summarize the rows of all planners on a plant, or of their plans only if it is empty.
 
     Returns:
@@ -170,7 +171,7 @@ Keyed = Mapping[tuple[int, int], Values]
 """(problem, repetition) -> values."""
 
 
-def _ratio(key: str, rows: Keyed, others: Keyed) -> dict[str, Any]:
+def _ratio(key: str, rows: Keyed, others: Keyed) -> JsonObject:
     count = sum(bool(known.get(key, False)) for known in rows.values())
     of = len(rows)
     mine, theirs = (
@@ -193,7 +194,7 @@ def _ratio(key: str, rows: Keyed, others: Keyed) -> dict[str, Any]:
     }
 
 
-def _figure(key: str, rows: Keyed, others: Keyed) -> dict[str, Any]:
+def _figure(key: str, rows: Keyed, others: Keyed) -> JsonObject:
     values = np.array([known[key] for known in rows.values() if key in known], float)
     q1, median, q3 = np.quantile(values, [0.25, 0.5, 0.75]).tolist()
     tails = np.quantile(values, list(TAILS.values()), method="higher").tolist()
@@ -225,7 +226,7 @@ def _pairs(mine: Mapping[int, float], theirs: Mapping[int, float]) -> Array:
     ).reshape(-1, 2)
 
 
-def _correct(summary: dict[str, dict[str, dict[str, dict[str, Any]]]]) -> None:
+def _correct(summary: dict[str, dict[str, dict[str, JsonObject]]]) -> None:
     """Add the corrected p-values of a table."""
     statistics = [
         item

@@ -17,6 +17,7 @@ from cnpgen.addons.benchmark.hypothesis_tests import (
 )
 from cnpgen.addons.benchmark.run_suite import Benchmark
 from cnpgen.schema.argument_types import checked_arguments
+from cnpgen.schema.tables import JsonObject
 from cnpgen.store.files.atomic import write_file
 
 FORMULA_STARTS = ("=", "+", "-", "@", "\t", "\r")  # of cells that spreadsheets execute
@@ -137,7 +138,7 @@ def _missing_text(rows: Sequence[Mapping[str, Any]]) -> str:
     )
 
 
-def cell_text(statistic: dict[str, Any] | None, printed: str | None = None) -> str:
+def cell_text(statistic: JsonObject | None, printed: str | None = None) -> str:
     """Format a ratio with its interval, or a figure with its quartiles, and the paper's value."""
     if statistic is None:
         return f"paper: {printed}" if printed else ""
@@ -154,7 +155,7 @@ def cell_text(statistic: dict[str, Any] | None, printed: str | None = None) -> s
     return text + (f" (paper: {printed})" if printed else "")
 
 
-def tail_text(statistic: dict[str, Any] | None) -> str:
+def tail_text(statistic: JsonObject | None) -> str:
     """Format the tails of a figure."""
     return (
         ""

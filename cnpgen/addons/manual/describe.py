@@ -28,6 +28,7 @@ from cnpgen.robots.urdf import urdf_tree
 from cnpgen.robots.urdf_parameters import urdf_parameters
 from cnpgen.schema import registry
 from cnpgen.schema.keys import PerJoint, Range, keys
+from cnpgen.schema.tables import JsonObject
 from cnpgen.store.joint_units import unit_of
 
 LIMITS = {  # with their units at joints that turn
@@ -278,7 +279,7 @@ def _use(pair: LinkPair) -> str:
     return "judges and solvers" if pair.for_solvers else "judges"
 
 
-def shape_to_dict(shape: Shape) -> dict[str, Any]:
+def shape_to_dict(shape: Shape) -> JsonObject:
     """Return links and pairs for JSON, in SI units."""
     capsules = [
         {
@@ -402,7 +403,7 @@ def kind_name(item: Stage | Constraint) -> str:
     return registry.name_of(group, type(item))
 
 
-def model_to_dict(model: Model) -> dict[str, Any]:
+def model_to_dict(model: Model) -> JsonObject:
     """Describe a model for JSON: its problem, its network, and whether motions may end with an acceleration."""
     return {
         "kind": "model",
@@ -412,7 +413,7 @@ def model_to_dict(model: Model) -> dict[str, Any]:
     }
 
 
-def describe_model(facts: dict[str, Any]) -> str:
+def describe_model(facts: JsonObject) -> str:
     """Describe a model in two lines."""
     text = {
         "free": "motions may end with a step of acceleration",
@@ -424,7 +425,7 @@ def describe_model(facts: dict[str, Any]) -> str:
     )
 
 
-def recipe_to_dict(recipe: Recipe) -> dict[str, Any]:
+def recipe_to_dict(recipe: Recipe) -> JsonObject:
     """Describe a recipe for JSON: everything it refers to resolved, in SI units, with derived values."""
     # A data set has a pipeline, and a pipeline has a problem.
     pipeline = recipe.pipeline if isinstance(recipe, DatasetRecipe) else recipe
@@ -433,7 +434,7 @@ def recipe_to_dict(recipe: Recipe) -> dict[str, Any]:
     kind = {Problem: "problem", Pipeline: "pipeline", DatasetRecipe: "dataset"}[
         type(recipe)
     ]
-    content: dict[str, Any] = {
+    content: JsonObject = {
         "kind": kind,
         "file": str(recipe.path),
         "recipe": resolved(recipe),

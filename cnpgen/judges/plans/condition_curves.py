@@ -5,9 +5,8 @@ from dataclasses import dataclass
 from typing import cast
 
 import numpy as np
-from numpy.typing import NDArray
 
-from cnpgen.arrays import Array
+from cnpgen.arrays import Array, Mask
 from cnpgen.judges.plans.joint_limits import is_proven
 from cnpgen.judges.plans.measure import MeasuredCondition, measure, name_part
 from cnpgen.problems.constraints.clearance import DistanceConstraint
@@ -46,7 +45,7 @@ class ConditionCurve:
     pairs: tuple[str, ...] = ()
 
     @property
-    def violated(self) -> NDArray[np.bool_]:
+    def violated(self) -> Mask:
         """Mask of the states at which a value is outside its bounds by more than the tolerance, shape (K,)."""
         outside = np.maximum(self.lower - self.values, self.values - self.upper)
         return np.asarray(~(outside <= self.tolerance).all(axis=0))

@@ -34,7 +34,7 @@ from cnpgen.problems.constraints.joint import MotorTorques, motor_conditions
 from cnpgen.problems.constraints.table import Table
 from cnpgen.robots.robot import Robot
 from cnpgen.schema.keys import field
-from cnpgen.store.field import Field
+from cnpgen.store.field import Field, Fields
 
 PROJECTION_STEPS = 3  # Newton steps from a millimetre to rounding error
 MAX_VELOCITY_RATIO = 1.005  # largest ratio of a plan's velocity to its limit
@@ -76,7 +76,7 @@ class AtRest(Stage):
         kept = ", which motions must end with" if self.end == "goal" else ""
         return f"set velocity and acceleration of the {self.end} to zero{kept}"
 
-    def outputs(self, context: Context) -> tuple[Field, ...]:
+    def outputs(self, context: Context) -> Fields:
         fields = _motion_fields(context, self.end)
         return (
             fields if self.end == "start" or self.acceleration == "zero" else fields[:1]
@@ -127,7 +127,7 @@ class TableVelocity(Stage):
             f" uniform between 0 and the first limit that it meets; zero in {100 * self.at_rest:.4g} % of the cases"
         )
 
-    def outputs(self, context: Context) -> tuple[Field, ...]:
+    def outputs(self, context: Context) -> Fields:
         return _motion_fields(context, "start")[:1]
 
     def writes(self, context: Context) -> tuple[str, ...]:
@@ -190,7 +190,7 @@ class TableAcceleration(Stage):
             " limits that it meets along a random direction"
         )
 
-    def outputs(self, context: Context) -> tuple[Field, ...]:
+    def outputs(self, context: Context) -> Fields:
         return _motion_fields(context, self.end)[1:]
 
     def prepare(self, context: Context) -> StageFunction:

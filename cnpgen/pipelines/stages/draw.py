@@ -1,7 +1,7 @@
 """Stages: draw or list start and goal positions of the tip, and draw the parameters of the problem."""
 
 import math
-from collections.abc import Collection, Iterable, Iterator, Sequence
+from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -12,7 +12,8 @@ from cnpgen.kernels.symbolic.kinematics import tip_position
 from cnpgen.pipelines.stages.candidate_table import in_world, in_world_box
 from cnpgen.pipelines.stages.stage import CandidateBatch, Context, Stage, StageFunction
 from cnpgen.schema.keys import Range, field
-from cnpgen.store.field import Field
+from cnpgen.schema.tables import NamedErrors
+from cnpgen.store.field import Field, Fields
 
 Position = tuple[float, float, float]
 MAX_TASKS = 100_000
@@ -46,7 +47,7 @@ class DrawPositions(Stage):
             else text
         )
 
-    def outputs(self, context: Context) -> tuple[Field, ...]:
+    def outputs(self, context: Context) -> Fields:
         return tuple(
             position_field(
                 end,
@@ -94,7 +95,7 @@ class DrawGoal(Stage):
             else text
         )
 
-    def outputs(self, context: Context) -> tuple[Field, ...]:
+    def outputs(self, context: Context) -> Fields:
         return (
             position_field(
                 "goal",
@@ -185,7 +186,7 @@ class GivenPositions(Stage):
         default=(),
     )
 
-    def validate(self) -> Iterator[tuple[str, str]]:
+    def validate(self) -> NamedErrors:
         if bool(self.goal) == bool(self.grid):
             yield "goal", "either a list of goals or a grid must be given, and not both"
         for key in ("grid", "counts"):
@@ -223,7 +224,7 @@ class GivenPositions(Stage):
         origin = "listed start positions" if self.start else "the base configuration"
         return f"take {self.tasks:,} {goals}, one after the other, from {origin}"
 
-    def outputs(self, context: Context) -> tuple[Field, ...]:
+    def outputs(self, context: Context) -> Fields:
         boxes = (("start", self._starts(context)), ("goal", self._goals()))
         positions = tuple(
             position_field(
@@ -276,7 +277,7 @@ class DrawParameters(Stage):
     def describe(self) -> str:
         return "draw the parameters of the problem uniformly in their ranges"
 
-    def outputs(self, context: Context) -> tuple[Field, ...]:
+    def outputs(self, context: Context) -> Fields:
         ranges = context.problem.parameters
         if not ranges:
             raise RecipeError(

@@ -38,7 +38,7 @@ from cnpgen.pipelines.stages.stage import (
 )
 from cnpgen.robots.robot import Robot
 from cnpgen.schema.keys import field
-from cnpgen.store.field import Field
+from cnpgen.store.field import Field, Fields
 
 ZERO_RESIDUAL_M = 1e-11  # residuals below this are treated as zero
 # Task column: hit speed as a fraction of the maximum speed.
@@ -66,7 +66,7 @@ class HittingVelocity(Stage):
         )
         return f"solve the linear program for the fastest joint velocity along the hit{slower}"
 
-    def outputs(self, context: Context) -> tuple[Field, ...]:
+    def outputs(self, context: Context) -> Fields:
         return (
             context.joint_field(
                 "goal_dq", "rad/s", "joint velocities at the goal", "target"
@@ -99,7 +99,7 @@ class HittingVelocity(Stage):
 
         return self._solve(context, draw_share)
 
-    def task_inputs(self, context: Context) -> tuple[Field, ...]:
+    def task_inputs(self, context: Context) -> Fields:
         """List the speed, and its share of the maximum speed.
 
         The share is 1 if neither is given.

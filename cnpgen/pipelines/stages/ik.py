@@ -1,6 +1,6 @@
 """Inverse kinematics: stages for positions of start, home and goal, free or vertical, and their step."""
 
-from collections.abc import Collection, Iterator
+from collections.abc import Collection
 from dataclasses import dataclass
 from functools import reduce
 from typing import Any
@@ -37,7 +37,8 @@ from cnpgen.pipelines.stages.stage import (
 from cnpgen.robots.plausible_values import find_implausible_value
 from cnpgen.robots.robot import Robot
 from cnpgen.schema.keys import Range, field
-from cnpgen.store.field import Field
+from cnpgen.schema.tables import NamedErrors
+from cnpgen.store.field import Fields
 
 # M and rad, before the last step (quadratic convergence, except with joints on their
 # limits).
@@ -193,7 +194,7 @@ class StartIK(GuessedIK):
     def describe(self) -> str:
         return f"solve the start configuration{self._how()} from {self._origin()}"
 
-    def outputs(self, context: Context) -> tuple[Field, ...]:
+    def outputs(self, context: Context) -> Fields:
         return (context.joint_field("start_q", "rad", "joint positions at the start"),)
 
     def prepare(self, context: Context) -> StageFunction:
@@ -224,7 +225,7 @@ class GoalIK(GuessedIK):
         since_version=2,
     )
 
-    def validate(self) -> Iterator[tuple[str, str]]:
+    def validate(self) -> NamedErrors:
         for name in ("from_start", "at_limit"):
             if getattr(self, name) and not self.guess:
                 yield name, "needs random guesses: give guess, too"
@@ -237,7 +238,7 @@ class GoalIK(GuessedIK):
             origin += f"; no joint may be farther than {self.max_change:.4g} rad from the start"
         return f"solve the goal configuration{self._how()} from {origin}"
 
-    def outputs(self, context: Context) -> tuple[Field, ...]:
+    def outputs(self, context: Context) -> Fields:
         return (
             context.joint_field(
                 "goal_q", "rad", "joint positions at the goal", "target"
@@ -427,7 +428,7 @@ class Home(GuessedIK):
         "box of tip positions of the other homes: x, y, z", unit="m"
     )
 
-    def validate(self) -> Iterator[tuple[str, str]]:
+    def validate(self) -> NamedErrors:
         if self.at_start + self.at_base > 1:
             yield (
                 "at_base",
@@ -442,7 +443,7 @@ class Home(GuessedIK):
             f" {100 * elsewhere:.4g} %"
         )
 
-    def outputs(self, context: Context) -> tuple[Field, ...]:
+    def outputs(self, context: Context) -> Fields:
         return (
             context.joint_field(
                 "home_q",

@@ -12,7 +12,6 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from cnpgen.arrays import Array
 from cnpgen.kernels.kernel import Kernel
@@ -199,7 +198,7 @@ def overshoot(
     dq: Array,
     *,
     margin: float = 0.0,
-) -> NDArray[np.float64]:
+) -> Array:
     """Return the overshoot of full braking over the worst edge of the table [m], shape (n,), by both kernels.
 
     It is -inf if a straight line stays inside by the margin [m] for 80 ms. The states

@@ -4,9 +4,8 @@ from collections.abc import Sequence
 from itertools import pairwise
 
 import numpy as np
-from numpy.typing import NDArray
 
-from cnpgen.arrays import Array
+from cnpgen.arrays import Array, Integers, Mask
 from cnpgen.kernels.collision.body_arrays import (
     LANES,
     PADDING_DISTANCE_M,
@@ -24,8 +23,6 @@ from cnpgen.problems.constraints.link_clearance import SelfClearance
 from cnpgen.problems.problem import Problem
 from cnpgen.robots.obstacle import Obstacle
 from cnpgen.robots.solid import place_obstacles
-
-Mask = NDArray[np.bool_]
 
 
 class _SceneChecker(CollisionChecker):
@@ -103,7 +100,7 @@ class SceneClearance:
     def are_clear(
         self,
         q: Array,
-        scene: NDArray[np.int64],
+        scene: Integers,
         scenes: BatchScenes,
         margin: float = 0.0,
         self_margin: float = 0.0,

@@ -11,7 +11,7 @@ from cnpgen.kernels.symbolic.symbolic_state import SymbolicState
 from cnpgen.pipelines.stages.stage import CandidateBatch, Context, Stage, StageFunction
 from cnpgen.robots.robot import Robot
 from cnpgen.schema.keys import field
-from cnpgen.store.field import Field
+from cnpgen.store.field import Field, Fields
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -27,7 +27,7 @@ class GravityTorque(Stage):
     def describe(self) -> str:
         return f"require that the torque that holds the {self.end} configuration, payload included, is within its limits"
 
-    def outputs(self, context: Context) -> tuple[Field, ...]:
+    def outputs(self, context: Context) -> Fields:
         return (
             Field(
                 f"{self.end}_torque_ratio",

@@ -10,7 +10,7 @@ from typing import ClassVar, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from cnpgen.arrays import AnyArray
+from cnpgen.arrays import AnyArray, Columns
 from cnpgen.errors import UsageError, nearest
 from cnpgen.robots.observation.camera import Camera
 from cnpgen.robots.observation.primitives import KINDS, MESH, Primitives
@@ -68,7 +68,7 @@ class Observation(ABC):
     @abstractmethod
     def observe(
         self, bodies: Primitives, seeds: Seeds, backend: ObservationBackend
-    ) -> dict[str, AnyArray]:
+    ) -> Columns:
         """Observe N scenes from their bodies and seeds, shape (N,): name -> array with a first axis of length N."""
 
 
@@ -89,7 +89,7 @@ class SurfaceCloud(Observation):
 
     def observe(
         self, bodies: Primitives, seeds: Seeds, backend: ObservationBackend
-    ) -> dict[str, AnyArray]:
+    ) -> Columns:
         """See ``Observation``."""
         return {"cloud": backend.surface_points(bodies, self.points, seeds)}
 
@@ -113,7 +113,7 @@ class CameraCloud(Observation):
 
     def observe(
         self, bodies: Primitives, seeds: Seeds, backend: ObservationBackend
-    ) -> dict[str, AnyArray]:
+    ) -> Columns:
         """See ``Observation``."""
         depth = backend.depth_images(bodies, self.camera)
         return {
@@ -153,7 +153,7 @@ class DistanceGrid(Observation):
         bodies: Primitives,
         seeds: Seeds,  # noqa: ARG002
         backend: ObservationBackend,
-    ) -> dict[str, AnyArray]:
+    ) -> Columns:
         """See ``Observation``."""
         axes = [
             np.linspace(*ends)
@@ -198,7 +198,7 @@ class BasisPoints(Observation):
         bodies: Primitives,
         seeds: Seeds,  # noqa: ARG002
         backend: ObservationBackend,
-    ) -> dict[str, AnyArray]:
+    ) -> Columns:
         """See ``Observation``."""
         return {"basis": backend.distances(bodies, self.positions)}
 
@@ -228,7 +228,7 @@ class ObjectTokens(Observation):
         bodies: Primitives,
         seeds: Seeds,  # noqa: ARG002
         backend: ObservationBackend,  # noqa: ARG002
-    ) -> dict[str, AnyArray]:
+    ) -> Columns:
         """See ``Observation``."""
         real = bodies.kinds >= 0
         order = np.argsort(~real, axis=1, kind="stable")  # bodies first

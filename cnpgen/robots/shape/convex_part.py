@@ -6,9 +6,8 @@ from typing import NamedTuple
 from xml.etree import ElementTree
 
 import numpy as np
-from numpy.typing import NDArray
 
-from cnpgen.arrays import Array
+from cnpgen.arrays import Array, Integers
 from cnpgen.errors import RecipeError
 from cnpgen.robots.shape.hull import CUBE, MAX_COORDINATE_M, check_solid
 from cnpgen.robots.shape.inline import corners_of, is_inline
@@ -58,8 +57,8 @@ class Contacts(NamedTuple):
             [m], shape (C, 2, 3).
     """
 
-    pair: NDArray[np.int64]
-    k: NDArray[np.int64]
+    pair: Integers
+    k: Integers
     distance: Array
     normal: Array
     points: Array

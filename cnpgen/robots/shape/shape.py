@@ -29,6 +29,7 @@ from cnpgen.robots.shape.link_pairs import (
 )
 from cnpgen.robots.urdf import urdf_tree
 from cnpgen.robots.urdf_changes import disabled_pairs
+from cnpgen.schema.tables import JsonObject
 from cnpgen.store.files.cache_entry import read_entry, write_entry
 
 if TYPE_CHECKING:
@@ -200,7 +201,7 @@ def _adjacent(urdf: str, shaped: set[str]) -> frozenset[frozenset[str]]:
     return frozenset(found)
 
 
-def _written(capsules: Capsules, pairs: Pairs) -> dict[str, Any]:
+def _written(capsules: Capsules, pairs: Pairs) -> JsonObject:
     entries = [
         asdict(each) | {"first": each.first.tolist(), "second": each.second.tolist()}
         for each in capsules
@@ -208,7 +209,7 @@ def _written(capsules: Capsules, pairs: Pairs) -> dict[str, Any]:
     return {"capsules": entries, "pairs": [asdict(pair) for pair in pairs]}
 
 
-def _read(content: dict[str, Any], convex_parts: Parts) -> tuple[Capsules, Pairs]:
+def _read(content: JsonObject, convex_parts: Parts) -> tuple[Capsules, Pairs]:
     """Return cached capsules and pairs.
 
     Raise ValueError if a capsule does not cover its link.

@@ -16,8 +16,8 @@ from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from cnpgen.arrays import AnyArray
 from cnpgen.errors import DatasetError, MachineError
 from cnpgen.store.files.atomic import machine_error
 from cnpgen.store.files.heaps import check_heaps
@@ -172,7 +172,7 @@ class Column:
         """Size of the numbers in memory [bytes]."""
         return math.prod(self.shape) * self.dtype.itemsize
 
-    def read(self, rows: slice | None = None) -> NDArray[Any]:
+    def read(self, rows: slice | None = None) -> AnyArray:
         """Return the numbers, by default of all rows."""
         from h5py import Dataset
 
