@@ -11,6 +11,9 @@ Array = NDArray[np.float64]
 AnyArray = NDArray[Any]
 """Numbers of a type that the caller chooses, such as float32 of stored rows."""
 
+Vector3 = tuple[float, float, float]
+"""Coordinates or lengths along x, y and z, or angles about them."""
+
 Mask = NDArray[np.bool_]
 """Truth values, one for each entry."""
 

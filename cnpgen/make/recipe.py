@@ -3,7 +3,7 @@
 import hashlib
 import json
 import tempfile
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from fractions import Fraction
@@ -29,7 +29,7 @@ from cnpgen.schema.arguments import concerning
 from cnpgen.schema.catalogue import load_recipe, read_kind, reference
 from cnpgen.schema.keys import NAME, RecipeLocation, field
 from cnpgen.schema.parsing import Reader, parse, stored_values
-from cnpgen.schema.tables import JsonObject
+from cnpgen.schema.tables import JsonMapping, JsonObject
 from cnpgen.schema.texts import read_own, utf8_text
 from cnpgen.schema.toml import is_kind, read_table
 from cnpgen.store.dataset_spec import GENERATOR_REVISION, DatasetSpec
@@ -114,7 +114,7 @@ def recipe_digest(recipe: Pipeline | DatasetRecipe) -> str:
     return resolved_digest(resolved(pipeline), pipeline.problem.urdf_text.encode())
 
 
-def resolved_digest(pipeline: Mapping[str, Any], urdf: bytes) -> str:
+def resolved_digest(pipeline: JsonMapping, urdf: bytes) -> str:
     """Hash the result of ``resolved`` for a pipeline, for example from the specification of a dataset, and its URDF.
 
     See ``recipe_digest``.

@@ -1,10 +1,9 @@
 """Pipelines: stages that sample the boundary conditions of a problem, their files, and the fields that they store."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 from cnpgen.errors import PluginError, RecipeError, UsageError
 from cnpgen.pipelines.stages.draw_scenes import DrawScenes
@@ -17,7 +16,7 @@ from cnpgen.schema.argument_types import checked_arguments
 from cnpgen.schema.catalogue import load_recipe, read_kind, reference
 from cnpgen.schema.keys import NAME, RecipeLocation, field
 from cnpgen.schema.parsing import Reader, parse, stored_values
-from cnpgen.schema.tables import NamedErrors
+from cnpgen.schema.tables import JsonMapping, NamedErrors
 from cnpgen.schema.toml import read_table
 from cnpgen.store.field import Field, Fields
 from cnpgen.store.scene_table import SCENE_ID
@@ -145,7 +144,7 @@ def _with_places(
 
 
 def restore_pipeline(
-    name: str, stages: Sequence[Mapping[str, Any]], problem: Problem
+    name: str, stages: Sequence[JsonMapping], problem: Problem
 ) -> Pipeline:
     """Rebuild a pipeline from the resolved stages of a dataset or model specification."""
     tables = [dict(stage) for stage in stages]

@@ -3,7 +3,7 @@
 import dataclasses
 import hashlib
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import cached_property
@@ -12,7 +12,7 @@ from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 
-from cnpgen.arrays import Array
+from cnpgen.arrays import Array, Vector3
 from cnpgen.errors import MachineError, UsageError
 from cnpgen.problems.constraints.axis import TipAxis
 from cnpgen.problems.constraints.clearance import ObjectContact, RobotClearance
@@ -50,7 +50,7 @@ from cnpgen.robots.urdf_elements import check_elements
 from cnpgen.schema import registry
 from cnpgen.schema.argument_types import checked_arguments
 from cnpgen.schema.keys import NAME, Range, field, to_dict
-from cnpgen.schema.tables import JsonObject, NamedErrors
+from cnpgen.schema.tables import JsonMapping, JsonObject, NamedErrors
 from cnpgen.store.files.cache_folder import (
     default_cache_folder,
     make_private_folder,
@@ -309,7 +309,7 @@ class Problem:
             )
 
     @property
-    def object_size(self) -> tuple[float, float, float] | None:
+    def object_size(self) -> Vector3 | None:
         """Edge lengths of the held object [m], None if nothing is held."""
         # The code of a plug-in may use names, poses and sizes as constants.
         return None if self.object is None else self.object.size
@@ -501,7 +501,7 @@ class Problem:
         ).hexdigest()
 
 
-def _structure_of(obstacle: Mapping[str, Any]) -> JsonObject:
+def _structure_of(obstacle: JsonMapping) -> JsonObject:
     """Return the keys of a resolved obstacle that kernels contain as constants: all but name, pose and sizes."""
     # Kernels contain the ranges of an obstacle as constants.
     if obstacle.get("x") is not None or obstacle.get("y") is not None:
@@ -575,7 +575,7 @@ def _all_of(obj: object) -> dict[str, str]:
     return label | {spec.name: repr(getattr(obj, spec.name)) for spec in others}
 
 
-def without_labels(problem: Mapping[str, Any]) -> JsonObject:
+def without_labels(problem: JsonMapping) -> JsonObject:
     """Remove title, version, file names and sources of limits from a resolved problem: they do not affect its motions."""
     robot = {key: value for key, value in problem["robot"].items() if key not in FILES}
     labels = {"title", "version"}
@@ -583,6 +583,6 @@ def without_labels(problem: Mapping[str, Any]) -> JsonObject:
     return kept | {"robot": robot, "limits": without_sources(problem["limits"])}
 
 
-def without_sources(limits: Mapping[str, Any]) -> JsonObject:
+def without_sources(limits: JsonMapping) -> JsonObject:
     """Remove the sources from resolved limits."""
     return {key: value for key, value in limits.items() if key != SOURCES}

@@ -4,6 +4,7 @@ import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
+from cnpgen.arrays import Vector3
 from cnpgen.robots.parameter_ranges import optional_key
 from cnpgen.robots.shape.hull import MAX_COORDINATE_M, check_solid
 from cnpgen.robots.shape.inline import corners_of, is_inline
@@ -52,19 +53,17 @@ class Obstacle:
     kind: str = optional_key(
         "kind of the obstacle", choices=tuple(_KEYS), default="box"
     )
-    position: tuple[float, float, float] | None = optional_key(
+    position: Vector3 | None = optional_key(
         "position of the centre, for a mesh of the origin of its file: x, y, z",
         unit="m",
     )
-    rotation: tuple[float, float, float] = optional_key(
+    rotation: Vector3 = optional_key(
         "rotation: roll, pitch and yaw about the world's axes, as <origin rpy> of a URDF",
         unit="rad",
         default=_OPTIONAL["rotation"],
         plausible=2 * math.pi,
     )
-    size: tuple[float, float, float] | None = optional_key(
-        "edge lengths of a box", unit="m", low=1e-6
-    )
+    size: Vector3 | None = optional_key("edge lengths of a box", unit="m", low=1e-6)
     radius: float | None = optional_key(
         "radius of a sphere, a cylinder, a capsule", unit="m", low=1e-6
     )
@@ -77,7 +76,7 @@ class Obstacle:
         "mesh file (STL, DAE, OBJ), relative to the problem file; its convex hull is used",
         default="",
     )
-    scale: tuple[float, float, float] = optional_key(
+    scale: Vector3 = optional_key(
         "scale factors of the mesh along x, y and z", default=_OPTIONAL["scale"]
     )
 

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from cnpgen.arrays import Vector3
 from cnpgen.robots.parameter_ranges import PAYLOAD_CENTRE, optional_key
 from cnpgen.schema.keys import PerJoint, Range, field
 from cnpgen.schema.tables import NamedErrors
@@ -28,13 +29,13 @@ class RobotSpec:
     base: tuple[float, ...] = field(
         "base configuration of the planned joints", unit="rad", plausible=100.0
     )
-    tip_offset: tuple[float, float, float] = optional_key(
+    tip_offset: Vector3 = optional_key(
         "offset of the tip in the frame 'tip': x, y, z",
         unit="m",
         default=(0.0, 0.0, 0.0),
         plausible=5.0,
     )
-    tip_rotation: tuple[float, float, float] = optional_key(
+    tip_rotation: Vector3 = optional_key(
         "rotation of the tip in the frame 'tip': roll, pitch and yaw about fixed axes",
         unit="rad",
         default=(0.0, 0.0, 0.0),
@@ -221,7 +222,7 @@ class Payload:
     """
 
     mass: float = field("mass", unit="kg", low=1e-9)
-    centre: tuple[float, float, float] = field(
+    centre: Vector3 = field(
         "centre of mass in the tip frame",
         unit="m",
         default=(0.0, 0.0, 0.0),
@@ -232,7 +233,7 @@ class Payload:
         unit="kg m^2",
         default=None,
     )
-    size: tuple[float, float, float] | None = field(
+    size: Vector3 | None = field(
         "edge lengths of a box of uniform density, in place of the inertia or, with touch_links, beside it",
         unit="m",
         default=None,
@@ -298,7 +299,7 @@ class Payload:
 class HeldObject:
     """Upright cuboid held rigidly with its center at the tip frame."""
 
-    size: tuple[float, float, float] = field(
+    size: Vector3 = field(
         "edge lengths along the tip frame's x, y, z", unit="m", low=1e-6, plausible=10.0
     )
     touch_links: tuple[str, ...] = optional_key(

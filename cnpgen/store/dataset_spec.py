@@ -12,10 +12,9 @@ from dataclasses import asdict, dataclass, field, replace
 from functools import cached_property
 from itertools import pairwise
 from pathlib import Path
-from typing import Any
 
 from cnpgen.errors import DatasetError, UsageError, nearest
-from cnpgen.schema.tables import JsonObject
+from cnpgen.schema.tables import JsonMapping, JsonObject
 from cnpgen.store.field import Field, Fields
 from cnpgen.store.files.atomic import read_file
 from cnpgen.store.files.document_structure import (
@@ -170,7 +169,7 @@ class DatasetSpec:
     title: str = ""
     license: str = ""
     recipe_sha256: str
-    recipe: Mapping[str, Any]
+    recipe: JsonMapping
     seed: int
     splits: Mapping[str, int]
     shard_size: int
@@ -180,7 +179,7 @@ class DatasetSpec:
     generator: str = "numpy SFC64 seeded by SeedSequence"
     revision: int = GENERATOR_REVISION
     fields: Fields
-    robot: Mapping[str, Any] = field(default_factory=dict)
+    robot: JsonMapping = field(default_factory=dict)
     versions: Mapping[str, str] = field(default_factory=dict)
     previous_splits: tuple[Mapping[str, int], ...] = ()
     scene_obstacles: int = 0
@@ -449,7 +448,7 @@ def to_json(spec: DatasetSpec) -> JsonObject:
     return {name: getattr(spec, name) for name in names} | converted
 
 
-def from_json(content: Mapping[str, Any]) -> DatasetSpec:
+def from_json(content: JsonMapping) -> DatasetSpec:
     """Rebuild a specification from the result of ``to_json``.
 
     A missing key or a wrong type raises DatasetError.

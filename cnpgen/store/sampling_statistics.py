@@ -6,13 +6,12 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import reduce
-from typing import Any
 
 import numpy as np
 
 from cnpgen.arrays import Integers
 from cnpgen.errors import DatasetError
-from cnpgen.schema.tables import JsonObject
+from cnpgen.schema.tables import JsonMapping, JsonObject
 from cnpgen.store.files.document_structure import ANY_KEY, NUMBER, TEXT, WHOLE
 from cnpgen.store.files.documents import plain
 
@@ -166,7 +165,7 @@ SAMPLING_STRUCTURE = {
 }
 
 
-def _density(content: Mapping[str, Any]) -> DensityMap:
+def _density(content: JsonMapping) -> DensityMap:
     (x_low, x_high), (y_low, y_high) = content["x"], content["y"]
     candidates, accepted = (
         np.array(content[key], np.int64) for key in ("candidates", "accepted")
@@ -184,7 +183,7 @@ def _density(content: Mapping[str, Any]) -> DensityMap:
     )
 
 
-def sampling_from_json(content: Mapping[str, Any]) -> SamplingStatistics:
+def sampling_from_json(content: JsonMapping) -> SamplingStatistics:
     """Rebuild sampling statistics from a dict with the structure ``SAMPLING_STRUCTURE``."""
     return SamplingStatistics(
         **{

@@ -3,11 +3,10 @@
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields
 from pathlib import Path
-from typing import Any
 
 from cnpgen.arrays import AnyArray
 from cnpgen.errors import CnpgenError, DatasetError
-from cnpgen.schema.tables import JsonObject
+from cnpgen.schema.tables import JsonMapping, JsonObject
 from cnpgen.store.dataset_spec import DatasetSpec, ShardTask, shard_attributes, shards
 from cnpgen.store.files.atomic import file_sha256
 from cnpgen.store.files.document_structure import (
@@ -94,7 +93,7 @@ def record_to_json(record: ShardRecord) -> JsonObject:
     }
 
 
-def record_from_json(content: Mapping[str, Any]) -> ShardRecord:
+def record_from_json(content: JsonMapping) -> ShardRecord:
     """Rebuild a record from the result of ``record_to_json``.
 
     A missing key or a wrong type raises DatasetError.

@@ -4,14 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from cnpgen.arrays import AnyArray, Integers, Mask
 from cnpgen.errors import DatasetError
-from cnpgen.schema.tables import JsonObject
+from cnpgen.schema.tables import JsonMapping, JsonObject
 from cnpgen.store.field import Field
 from cnpgen.store.files.document_structure import NUMBER, WHOLE, check_structure
 
@@ -122,7 +121,7 @@ STATISTICS_STRUCTURE = {
 _HISTOGRAM_STRUCTURE = {"low": [NUMBER], "high": [NUMBER], "counts": [[WHOLE]]}
 
 
-def statistics_from_json(content: Mapping[str, Any]) -> FieldStatistics:
+def statistics_from_json(content: JsonMapping) -> FieldStatistics:
     """Rebuild statistics from ``STATISTICS_STRUCTURE``.
 
     Inconsistent shapes or counts raise ValueError.

@@ -3,16 +3,14 @@
 import json
 import math
 import time
-from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from cnpgen.arrays import AnyArray, Mask
 from cnpgen.errors import DatasetError, UsageError
-from cnpgen.schema.tables import JsonObject
+from cnpgen.schema.tables import JsonMapping, JsonObject
 from cnpgen.store.files.checksum_file import (
     Content,
     read_with_checksum,
@@ -92,7 +90,7 @@ class State:
     best: Best
     steps: int
     imitating: int = 0
-    metric: Mapping[str, Any] = field(default_factory=dict)
+    metric: JsonMapping = field(default_factory=dict)
     seconds: float = 0.0
     checking: float = 0.0
     log: list[str] = field(default_factory=list)
@@ -180,7 +178,7 @@ def from_content(content: Content) -> State:
 class Checkpoints:
     """Checkpoints of one run in a file, written at intervals, with its JSON-able settings, dataset and steps."""
 
-    def __init__(self, path: Path, identity: Mapping[str, Any]) -> None:
+    def __init__(self, path: Path, identity: JsonMapping) -> None:
         self.path = path
         # In the form in which it is read back, so that equal identities compare as
         # equal.

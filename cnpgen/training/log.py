@@ -1,12 +1,11 @@
 """Training log, one JSON object per line, in a file to follow the run and in the checkpoint; its learning curve."""
 
 import json
-from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from cnpgen.errors import UsageError
-from cnpgen.schema.tables import JsonObject
+from cnpgen.schema.tables import JsonMapping, JsonObject
 from cnpgen.store.files.atomic import committing, write_file
 from cnpgen.store.files.documents import parse_json
 from cnpgen.store.files.figure_file import new_figure
@@ -30,7 +29,7 @@ class TrainingLog:
         self.lines = lines
         write_file(path, self.text)
 
-    def write(self, record: Mapping[str, Any]) -> None:
+    def write(self, record: JsonMapping) -> None:
         """Append a record."""
         line = json.dumps(record, allow_nan=False)
         self.lines.append(line)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -22,7 +21,7 @@ from cnpgen.problems.problem_record import (
 from cnpgen.schema.argument_types import checked_arguments
 from cnpgen.schema.arguments import concerning, integer
 from cnpgen.schema.old_keywords import with_old_keywords
-from cnpgen.schema.tables import JsonObject
+from cnpgen.schema.tables import JsonMapping, JsonObject
 from cnpgen.store.files.atomic import check_writable, file_sha256
 from cnpgen.store.files.documents import differences, plain
 from cnpgen.store.files.file_lock import output_lock
@@ -60,7 +59,7 @@ class Trained:
 
     model: Model
     path: Path
-    score: Mapping[str, Any]
+    score: JsonMapping
     made: bool = True
     times: Times = NO_TIME
 
@@ -208,7 +207,7 @@ def _save(
     request: _TrainingRequest,
     state: State,
     log: TrainingLog,
-    score: Mapping[str, Any],
+    score: JsonMapping,
 ) -> Model:
     """Save the best model with its log and its score in place of the checkpoint; return it."""
     # The checkpoint lacks this line, so that it is written once.
@@ -231,7 +230,7 @@ def _read_initial_model(
         return load_model(start_from), file_sha256(find_model(start_from))
 
 
-def _finished(path: Path, identity: Mapping[str, Any]) -> Trained:
+def _finished(path: Path, identity: JsonMapping) -> Trained:
     """Return the existing model if it is of the same run."""
     hint = "train another file, or replace it with {force}"
     try:
@@ -250,7 +249,7 @@ def _finished(path: Path, identity: Mapping[str, Any]) -> Trained:
     return Trained(model, path, model.training["score"], made=False)
 
 
-def _outcome(state: State, score: Mapping[str, Any]) -> JsonObject:
+def _outcome(state: State, score: JsonMapping) -> JsonObject:
     """Return steps, times and score of a run, for the model's file."""
     return {
         "steps": state.adam.step,

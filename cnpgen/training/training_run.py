@@ -1,9 +1,8 @@
 """A training run: steps, log, validation, checkpoints, and selection of the best model."""
 
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
@@ -14,14 +13,14 @@ from cnpgen.losses.plan_loss import PlanLoss
 from cnpgen.losses.quadrature import rotating_shift
 from cnpgen.machine.signals import signals_deferred
 from cnpgen.planner.model import Model
-from cnpgen.schema.tables import JsonObject
+from cnpgen.schema.tables import JsonMapping, JsonObject
 from cnpgen.training.adam import learning_rate
 from cnpgen.training.checkpoint import Best, Checkpoints, State, Sums
 from cnpgen.training.log import TrainingLog
 from cnpgen.training.step import Learner
 from cnpgen.training.training_rows import Rows, StepRows
 
-Watcher = Callable[[Mapping[str, Any]], None]
+Watcher = Callable[[JsonMapping], None]
 
 LOG_LINES = 100  # per run
 # Between the shifts of successive steps; coprime to the number of shifts.
@@ -44,7 +43,7 @@ class Run:
     rows: Rows
     metric: Metric
     model: Callable[[AnyArray], Model]
-    validate: Callable[[Model], Mapping[str, Any]]
+    validate: Callable[[Model], JsonMapping]
     initial_parameters: AnyArray | None = None
 
     def __post_init__(self) -> None:

@@ -13,7 +13,7 @@ import numpy as np
 
 from cnpgen.addons.benchmark.simulator.executed import PLANE_TOLERANCE_M, succeeded
 from cnpgen.arrays import Array
-from cnpgen.schema.tables import JsonObject
+from cnpgen.schema.tables import JsonMapping, JsonObject
 
 FLAGS = {  # of a row; those from "at the goal, executed" on need an execution
     "planned": "a plan was found",
@@ -63,7 +63,7 @@ Values = dict[str, bool | float]
 
 
 def values_of(
-    row: Mapping[str, Any], plant: str = "", plane_tolerance: float = PLANE_TOLERANCE_M
+    row: JsonMapping, plant: str = "", plane_tolerance: float = PLANE_TOLERANCE_M
 ) -> Values:
     """Return the known flags and figures of a row; empty if the planner or the plant does not apply.
 
@@ -95,7 +95,7 @@ def values_of(
     return {**values, **_values_of_verdict(row.get("verdict"))}
 
 
-def _values_of_verdict(verdict: Mapping[str, Any] | None) -> Values:
+def _values_of_verdict(verdict: JsonMapping | None) -> Values:
     """Return the flags and figures of a plan; without a plan, it is not valid."""
     if verdict is None:
         return {"valid": False, "paper_valid": False, "paper_finished": False}
@@ -115,7 +115,7 @@ def _values_of_verdict(verdict: Mapping[str, Any] | None) -> Values:
 
 
 def summarize_results(
-    results: Mapping[str, Sequence[Mapping[str, Any]]],
+    results: Mapping[str, Sequence[JsonMapping]],
     plant: str = "",
     *,
     reference: str | None = None,

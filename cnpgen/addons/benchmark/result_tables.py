@@ -3,7 +3,7 @@
 import csv
 import io
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +17,7 @@ from cnpgen.addons.benchmark.hypothesis_tests import (
 )
 from cnpgen.addons.benchmark.run_suite import Benchmark
 from cnpgen.schema.argument_types import checked_arguments
-from cnpgen.schema.tables import JsonObject
+from cnpgen.schema.tables import JsonMapping, JsonObject, TextRows
 from cnpgen.store.files.atomic import write_file
 
 FORMULA_STARTS = ("=", "+", "-", "@", "\t", "\r")  # of cells that spreadsheets execute
@@ -86,11 +86,11 @@ def save_benchmark_tables(benchmark: Benchmark, folder: str | Path) -> tuple[Pat
     return paths
 
 
-def table_rows(benchmark: Benchmark, plant: str) -> list[tuple[str, ...]]:
+def table_rows(benchmark: Benchmark, plant: str) -> TextRows:
     """Return the comparison on a plant: a head, then one row per ratio and figure, with the paper's values."""
     summary = benchmark.summary(plant)
     printed = PRINTED.get(benchmark.suite.name, {})
-    rows: list[tuple[str, ...]] = [(f"{plant} plant" if plant else "planned", *summary)]
+    rows: TextRows = [(f"{plant} plant" if plant else "planned", *summary)]
     missing = {
         name: _missing_text(benchmark.results[name])
         for name in summary
@@ -129,7 +129,7 @@ def _constraints(benchmark: Benchmark) -> set[str]:
     return {constraint["use"] for constraint in content["constraint"]}
 
 
-def _missing_text(rows: Sequence[Mapping[str, Any]]) -> str:
+def _missing_text(rows: Sequence[JsonMapping]) -> str:
     """Return the reason why a planner has no values: it does not apply, or the plant has not executed its plans."""
     return (
         NOT_APPLICABLE

@@ -39,7 +39,7 @@ from cnpgen.schema import registry
 from cnpgen.schema.argument_types import checked_arguments
 from cnpgen.schema.arguments import concerning
 from cnpgen.schema.old_keywords import with_old_keywords
-from cnpgen.schema.tables import JsonObject
+from cnpgen.schema.tables import JsonMapping, JsonObject
 from cnpgen.store.files.documents import plain
 
 PROBLEMS_PER_TASK = 4  # of a worker; starting a planner takes some seconds
@@ -124,7 +124,7 @@ def run_benchmark(
     planners: Sequence[str] = FASTEST,
     n: int | None = None,
     plants: Sequence[str | Plant] = (),
-    parameters: Mapping[str, Mapping[str, Any]] | None = None,
+    parameters: Mapping[str, JsonMapping] | None = None,
     workers: int | None = None,
     force: bool = False,
     progress: Progress | None = None,
@@ -214,7 +214,7 @@ def _checked_plants(
 def _checked_planners(
     planners: Sequence[str],
     of_suite: PlannerFields,
-    parameters: Mapping[str, Mapping[str, Any]],
+    parameters: Mapping[str, JsonMapping],
 ) -> PlannerFields:
     """Return planner -> given values of its fields, after checking names before any work."""
     known = registry.names(PLANNERS)
@@ -243,7 +243,7 @@ def _checked_planners(
     }
 
 
-def _checked_parameters(planner: str, parameters: Mapping[str, Any]) -> JsonObject:
+def _checked_parameters(planner: str, parameters: JsonMapping) -> JsonObject:
     """Return the values of all fields of a planner."""
     try:
         # A dataclass, as its contract requires.

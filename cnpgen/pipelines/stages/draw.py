@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from cnpgen.arrays import Array
+from cnpgen.arrays import Array, Vector3
 from cnpgen.errors import RecipeError
 from cnpgen.kernels.symbolic.kinematics import tip_position
 from cnpgen.pipelines.stages.candidate_table import in_world, in_world_box
@@ -15,7 +15,6 @@ from cnpgen.schema.keys import Range, field
 from cnpgen.schema.tables import NamedErrors
 from cnpgen.store.field import Field, Fields
 
-Position = tuple[float, float, float]
 MAX_TASKS = 100_000
 
 
@@ -171,7 +170,7 @@ def _box(ranges: tuple[Range, ...]) -> str:
 class GivenPositions(Stage):
     """Stage: goal positions of a list or a grid, with listed start positions or the base configuration."""
 
-    goal: tuple[Position, ...] = field(
+    goal: tuple[Vector3, ...] = field(
         "goal positions: x, y, z of each", unit="m", default=()
     )
     grid: tuple[Range, ...] = field(
@@ -180,7 +179,7 @@ class GivenPositions(Stage):
     counts: tuple[int, ...] = field(
         "number of positions along x, y, z, ends included", low=1, default=()
     )
-    start: tuple[Position, ...] = field(
+    start: tuple[Vector3, ...] = field(
         "start positions, one for all or one per goal; default: the base configuration",
         unit="m",
         default=(),

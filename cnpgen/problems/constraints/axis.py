@@ -8,14 +8,14 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from cnpgen.arrays import Array
+from cnpgen.arrays import Array, Vector3
 from cnpgen.problems.constraints.constraint import (
     Condition,
     Conditions,
     Constraint,
     End,
 )
-from cnpgen.problems.constraints.tip_manifold import Vector, along, beside, unit
+from cnpgen.problems.constraints.tip_manifold import along, beside, unit
 from cnpgen.robots.parameter_ranges import UPRIGHT_TOLERANCE
 from cnpgen.schema.keys import field
 
@@ -142,10 +142,10 @@ class Axis(TipAxis):
     """Constraint: a tip axis is within an angle of a direction, or aligned with it and at rest at the ends."""
 
     reason = "tool tilted"
-    axis: Vector = field(
+    axis: Vector3 = field(
         "axis in the tip frame, of any length", default=(0.0, 0.0, 1.0)
     )
-    direction: Vector = field(
+    direction: Vector3 = field(
         "direction in the world, of any length", default=(0.0, 0.0, 1.0)
     )
     angle: float = field(

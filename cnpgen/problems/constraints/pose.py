@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from cnpgen.arrays import Array
+from cnpgen.arrays import Array, Vector3
 from cnpgen.problems.constraints.constraint import Condition, Conditions, End
 from cnpgen.problems.constraints.tip_manifold import TipManifold, TipRegion
 from cnpgen.schema.keys import Range, field
@@ -32,7 +32,7 @@ class Pose(TipManifold):
     held_name = "pose position"
     velocity_name = "velocity out of the pose"
     acceleration_name = "acceleration out of the pose"
-    rpy: tuple[float, float, float] = field(
+    rpy: Vector3 = field(
         "orientation in the world: roll, pitch, yaw, as in a URDF",
         unit="rad",
         plausible=2 * np.pi,

@@ -26,7 +26,6 @@ if TYPE_CHECKING:
     from cnpgen.kernels.symbolic.symbolic_state import SymbolicState
     from cnpgen.world.world import World
 
-Vector = tuple[float, float, float]
 Vectors = Sequence[Sequence[float]]  # Python floats, used in scalar products
 # Phases between which a motion that starts off the manifold must reach it.
 BOUND_KINKS = 0.1, 0.3

@@ -10,7 +10,7 @@ from typing import ClassVar, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from cnpgen.arrays import AnyArray, Columns
+from cnpgen.arrays import AnyArray, Columns, Vector3
 from cnpgen.errors import UsageError, nearest
 from cnpgen.robots.observation.camera import Camera
 from cnpgen.robots.observation.primitives import KINDS, MESH, Primitives
@@ -19,7 +19,6 @@ from cnpgen.schema.argument_types import check_fields
 from cnpgen.schema.arguments import integer
 
 Values = NDArray[np.float32]
-Corner = tuple[float, float, float]
 
 MAX_OBSERVED_POINTS = 10_000_000  # of one observation of one scene
 MIN_GRID_EXTENT_M = 1e-6
@@ -132,8 +131,8 @@ class DistanceGrid(Observation):
     """
 
     name = "distances"
-    low: Corner = WORKSPACE[0]
-    high: Corner = WORKSPACE[1]
+    low: Vector3 = WORKSPACE[0]
+    high: Vector3 = WORKSPACE[1]
     shape: tuple[int, int, int] = (32, 32, 32)
 
     def __post_init__(self) -> None:
@@ -175,8 +174,8 @@ class BasisPoints(Observation):
 
     name = "basis"
     points: int = 512
-    low: Corner = WORKSPACE[0]
-    high: Corner = WORKSPACE[1]
+    low: Vector3 = WORKSPACE[0]
+    high: Vector3 = WORKSPACE[1]
 
     def __post_init__(self) -> None:
         check_fields(self)
@@ -278,7 +277,7 @@ def as_observation(kind: str | Observation) -> Observation:
     return OBSERVATIONS[kind]()
 
 
-def _check_corners(low: Corner, high: Corner) -> None:
+def _check_corners(low: Vector3, high: Vector3) -> None:
     if not (
         np.isfinite([*low, *high]).all()
         and (np.subtract(high, low) >= MIN_GRID_EXTENT_M).all()

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from cnpgen.arrays import Array
+from cnpgen.arrays import Array, Vector3
 from cnpgen.errors import RecipeError, nearest
 from cnpgen.robots.chain import Chain, frame_of
 from cnpgen.robots.robot_spec import HeldObject
@@ -38,7 +38,6 @@ if TYPE_CHECKING:
 Capsules = tuple[Capsule, ...]
 Pairs = tuple[LinkPair, ...]
 Parts = tuple[ConvexPart, ...]
-Size = tuple[float, float, float]
 
 # Of the computation of capsules and pairs; cached results of another revision are
 # ignored.
@@ -273,7 +272,7 @@ def load_held_shape(
 
 
 def with_held_object(
-    shape: Shape, held: Shape | None, chain: Chain, size: Size
+    shape: Shape, held: Shape | None, chain: Chain, size: Vector3
 ) -> Shape:
     """Return the link geometry of a robot with the held object, of these edge lengths [m], as a further link.
 
@@ -304,7 +303,7 @@ def with_held_object(
     )
 
 
-def _box(size: Size, rotation: Array, translation: Array) -> ConvexPart:
+def _box(size: Vector3, rotation: Array, translation: Array) -> ConvexPart:
     return ConvexPart(HELD_OBJECT, CUBE * np.array(size)).moved(rotation, translation)
 
 

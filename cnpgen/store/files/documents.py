@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from cnpgen.errors import DatasetError
-from cnpgen.schema.tables import JsonObject
+from cnpgen.schema.tables import JsonMapping, JsonObject
 from cnpgen.store.files.atomic import read_file, write_file
 from cnpgen.store.files.document_structure import Structure, check_structure
 from cnpgen.store.files.size_limits import MAX_DOCUMENT_BYTES, MAX_DOCUMENT_DEPTH
@@ -119,7 +119,7 @@ def render(value: Any, indent: str = "") -> str:
 
 
 def save_document(
-    path: Path, document: Mapping[str, Any], *, work: Path | None = None
+    path: Path, document: JsonMapping, *, work: Path | None = None
 ) -> None:
     """Write a document with its checksum, atomically.
 

@@ -3,7 +3,6 @@
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 
@@ -13,7 +12,7 @@ from cnpgen.addons.benchmark.simulator.simulator_scene import SimulatorScene
 from cnpgen.addons.benchmark.simulator.tip import Tip
 from cnpgen.arrays import Array, Mask
 from cnpgen.judges.plans.metrics import tilt
-from cnpgen.schema.tables import JsonObject
+from cnpgen.schema.tables import JsonMapping, JsonObject
 
 # Of the mallet's height, as in the Air Hockey Challenge (2023).
 
@@ -130,7 +129,7 @@ class Executed:
 
 
 def succeeded(
-    executed: Mapping[str, Any], plane_tolerance: float = PLANE_TOLERANCE_M
+    executed: JsonMapping, plane_tolerance: float = PLANE_TOLERANCE_M
 ) -> bool:
     """Return whether an execution succeeded, from the result of ``Executed.to_dict``.
 
