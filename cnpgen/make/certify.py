@@ -113,13 +113,13 @@ class CertifiedPlan(Stage):
                 name: np.ascontiguousarray(values.T)
                 for name, values in candidates.columns.items()
             }
-            scenes, poses = None, dict[str, Array]()
+            scenes = None
             if candidates.scenes is not None:
                 scenes = candidates.scenes.table[candidates.scene]
-                poses = {OBSTACLE_POSES: scene_poses(context.problem.obstacle, scenes)}
             guess = None
             if planner is not None:
                 boundary = planner_boundary(columns, planner)
+                poses = _poses(context, scenes)
                 guess = planner.plan_batch(boundary, columns=poses).motion
             # Workers are processes already: threads of linear algebra would compete for
             # their cores.
@@ -137,6 +137,13 @@ class CertifiedPlan(Stage):
             candidates.reject(valid, NO_PLAN)
 
         return work
+
+
+def _poses(context: Context, scenes: SceneTable | None) -> dict[str, Array]:
+    """Return the columns with the obstacles of scenes; none without scenes."""
+    if scenes is None:
+        return {}
+    return {OBSTACLE_POSES: scene_poses(context.problem.obstacle, scenes)}
 
 
 def certified(

@@ -213,7 +213,8 @@ class ProblemRecord(StoredProblem):
         Returns:
             Tip positions in the world frame [m], shape (N, 3).
         """
-        (_, robot), q = open_problem(self), numbers("q", q)
+        _, robot = open_problem(self)
+        q = numbers("q", q)
         if q.ndim != 2 or q.shape[1] != robot.n:
             raise UsageError(
                 f"must have shape (N, {robot.n}), got {q.shape}", argument="q"

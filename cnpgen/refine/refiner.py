@@ -168,10 +168,8 @@ class Refiner:
             return None
         if not np.isfinite(task.rate).all() or not np.any(task.rate > 0):
             return None
-        motion, rate = (
-            self.check.transcription(task),
-            np.maximum(task.rate, MIN_RATE_FRACTION * task.rate.max()),
-        )
+        motion = self.check.transcription(task)
+        rate = np.maximum(task.rate, MIN_RATE_FRACTION * task.rate.max())
         return (
             motion.pack(task.path, rate)
             if motion.duration(rate) < MAX_INPUT_DURATION_S
@@ -310,7 +308,8 @@ class Refiner:
         extra: Array | None = None,
     ) -> Result:
         """Run a level again with larger required distances where hulls collide between its grid points."""
-        feedback, motion = self._feedback(level), self.transcription(task, level)
+        feedback = self._feedback(level)
+        motion = self.transcription(task, level)
         accepted = self.accepted_at_ends(task)
         for _ in range(MAX_FEEDBACKS):
             path, _ = motion.unpack(result.x)
@@ -320,10 +319,8 @@ class Refiner:
             if missing is None:
                 break
             extra = missing if extra is None else extra + missing
-            earlier, result = (
-                result.iterations,
-                self.run_level(task, level, result.x, extra=extra),
-            )
+            earlier = result.iterations
+            result = self.run_level(task, level, result.x, extra=extra)
             result = replace(result, iterations=earlier + result.iterations)
         return result
 
@@ -436,10 +433,8 @@ class Refiner:
 
     def other_guesses(self, task: RefinementTask) -> list[Array]:
         """Return the variables of the other initial guesses."""
-        arguments, center = (
-            self._guess_arguments(task),
-            (self.robot.position_lower + self.robot.position_upper) / 2,
-        )
+        arguments = self._guess_arguments(task)
+        center = (self.robot.position_lower + self.robot.position_upper) / 2
         guesses = [
             initial_guesses.straight_line(*arguments),
             initial_guesses.line_through(*arguments, configuration=self.robot.home),

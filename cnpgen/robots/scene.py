@@ -202,7 +202,8 @@ def make_scene_table(
 
 def _quaternions(rotation: Array) -> Array:
     """Return the quaternions (w, x, y, z) of roll, pitch and yaw about fixed axes [rad], shape (M, 3) -> (M, 4)."""
-    (cr, cp, cy), (sr, sp, sy) = np.cos(rotation.T / 2), np.sin(rotation.T / 2)
+    cr, cp, cy = np.cos(rotation.T / 2)
+    sr, sp, sy = np.sin(rotation.T / 2)
     w = cr * cp * cy + sr * sp * sy
     x = sr * cp * cy - cr * sp * sy
     y = cr * sp * cy + sr * cp * sy

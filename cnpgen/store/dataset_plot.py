@@ -134,11 +134,9 @@ def _draw_motions(axis: "Axes", rows: Columns) -> None:
         x, y = rows[f"{end}_xyz"][:, :2].T
         axis.plot(x, y, ".", color=color, markersize=2, label=end)
     if "hit_angle" in rows and "hit_speed" in rows:
-        (x, y), angle, length = (
-            rows["goal_xyz"][:, :2].T,
-            rows["hit_angle"],
-            ARROW_DURATION_S * rows["hit_speed"],
-        )
+        x, y = rows["goal_xyz"][:, :2].T
+        angle = rows["hit_angle"]
+        length = ARROW_DURATION_S * rows["hit_speed"]
         arrows: dict[str, Any] = {
             "angles": "xy",
             "scale_units": "xy",

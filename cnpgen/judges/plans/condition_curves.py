@@ -101,7 +101,8 @@ def _unit_of(condition: MeasuredCondition) -> tuple[float, str, float]:
 
 def _bounded_curve(condition: MeasuredCondition) -> ConditionCurve:
     """Convert one value with its bounds; an equality becomes the deviation from its value."""
-    stated, (factor, shown, tolerance) = condition.condition, _unit_of(condition)
+    stated = condition.condition
+    factor, shown, tolerance = _unit_of(condition)
     center = stated.lower[0] if stated.is_equality else 0.0
     return ConditionCurve(
         stated.name,
@@ -117,7 +118,8 @@ def _bounded_curve(condition: MeasuredCondition) -> ConditionCurve:
 
 def _distance_inside(problem: Problem, condition: MeasuredCondition) -> ConditionCurve:
     """Convert several values, whose bounds may differ, to distances from the closer bound, positive inside."""
-    stated, (factor, shown, tolerance) = condition.condition, _unit_of(condition)
+    stated = condition.condition
+    factor, shown, tolerance = _unit_of(condition)
     count = condition.g.shape[1]
     parts = tuple(
         name_part(problem, condition.constraint, stated, i)

@@ -220,7 +220,8 @@ def velocity_of_tip(robot: Robot) -> Any:
     """Build ``(q, dq) -> velocity of the tip`` [m/s]."""
     import casadi as ca
 
-    (q_sx, q), (dq_sx, dq) = symbols("q", robot.n), symbols("dq", robot.n)
+    q_sx, q = symbols("q", robot.n)
+    dq_sx, dq = symbols("dq", robot.n)
     velocity = tip_velocity(forward_kinematics(robot.chain, q), dq)
     return ca.Function("velocity_of_tip", [q_sx, dq_sx], [ca.vertcat(*velocity)])
 
@@ -280,11 +281,9 @@ def table_velocity(robot: Robot) -> Any:
     """
     import casadi as ca
 
-    (q_sx, q), (u_sx, u), (s_sx, s) = (
-        symbols("q", robot.n),
-        symbols("u", robot.n),
-        symbols("s", 1),
-    )
+    q_sx, q = symbols("q", robot.n)
+    u_sx, u = symbols("u", robot.n)
+    s_sx, s = symbols("s", 1)
     kin = forward_kinematics(robot.chain, q)
     limit = [float(x) for x in robot.velocity_limit]
     on_manifold = _project(

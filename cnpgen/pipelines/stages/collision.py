@@ -212,10 +212,8 @@ def _minimum_distance(
     """Build the minimum distance of capsules (first point, second point, radius) from the obstacles [m]."""
     import casadi as ca
 
-    (q_sx, q), (poses_sx, poses) = (
-        symbols("q", robot.n),
-        symbols("obstacle_poses", problem.scene_width),
-    )
+    q_sx, q = symbols("q", robot.n)
+    poses_sx, poses = symbols("obstacle_poses", problem.scene_width)
     zero = [0.0] * robot.n
     state = SymbolicState(robot, q, zero, zero, poses, problem.obstacle, None)
     nearest = ca.SX(np.inf)

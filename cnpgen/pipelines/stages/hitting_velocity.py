@@ -179,11 +179,9 @@ def hitting_velocity(robot: Robot, *, min_speed: float) -> Any:
     """
     import casadi as ca
 
-    (q_sx, q), (d_sx, d), (normal_sx, normal) = (
-        symbols("q", robot.n),
-        direction_symbols(robot),
-        symbols("normal", 3),
-    )
+    q_sx, q = symbols("q", robot.n)
+    d_sx, d = direction_symbols(robot)
+    normal_sx, normal = symbols("normal", 3)
     jacobian = forward_kinematics(robot.chain, q).jacobian
     # Speed along the hit: sum over joints of (d . J_i) dq_i.
     forward = [along(d, column) for column in jacobian]

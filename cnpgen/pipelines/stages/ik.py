@@ -302,7 +302,8 @@ def ik_step(
     """
     import casadi as ca
 
-    (q_sx, q), (p_sx, p) = symbols("q", robot.n), symbols("p", 3)
+    q_sx, q = symbols("q", robot.n)
+    p_sx, p = symbols("p", 3)
     held_sx, held = symbols("held", robot.n)
     kin = forward_kinematics(robot.chain, q)
     # Rows of the task: three of position, two of tilt.
@@ -483,9 +484,7 @@ class Home(GuessedIK):
         """Use the start: goals of tasks are chosen near the start configuration."""
 
         def work(candidates: CandidateBatch, _random: np.random.Generator) -> None:
-            candidates["home_q"], candidates["home_xyz"] = (
-                candidates["start_q"],
-                candidates["start_xyz"],
-            )
+            candidates["home_q"] = candidates["start_q"]
+            candidates["home_xyz"] = candidates["start_xyz"]
 
         return work

@@ -38,7 +38,8 @@ class _SceneChecker(CollisionChecker):
 
     def prepare_scenes(self, scenes: BatchScenes) -> None:
         """Build the arrays of all scenes of a batch, for ``place_scene``."""
-        fixed, (bodies, boxes) = len(self._fixed), scenes.bodies
+        fixed = len(self._fixed)
+        bodies, boxes = scenes.bodies
         together = np.zeros((len(scenes), fixed + bodies.shape[1]), bodies.dtype)
         together[:, :fixed] = self._fixed
         together[:, fixed:] = bodies

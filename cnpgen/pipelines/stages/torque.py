@@ -59,10 +59,8 @@ def torque_ratio(robot: Robot) -> Any:
     """
     import casadi as ca
 
-    (q_sx, q), (parameters_sx, parameters) = (
-        symbols("q", robot.n),
-        symbols("parameters", len(robot.parameters)),
-    )
+    q_sx, q = symbols("q", robot.n)
+    parameters_sx, parameters = symbols("parameters", len(robot.parameters))
     zero = [0.0] * robot.n
     # Friction at rest is in the limit, so torques are those of the rigid body.
     torque = SymbolicState(robot, q, zero, zero, parameters, (), None).torque

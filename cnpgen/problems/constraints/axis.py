@@ -190,10 +190,8 @@ class Axis(TipAxis):
         """Evaluate the angle between axis and direction [rad], or its cosine for a range of angles."""
         if not self.angle:
             return super().judged(world)
-        (condition,), angle = (
-            self._held(self._measured_axis(world), {}),
-            world.parameters.values.get(UPRIGHT_TOLERANCE),
-        )
+        (condition,) = self._held(self._measured_axis(world), {})
+        angle = world.parameters.values.get(UPRIGHT_TOLERANCE)
         if angle is None:
             return (condition,)
         return (

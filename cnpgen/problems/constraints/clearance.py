@@ -116,7 +116,8 @@ class RobotClearance(DistanceConstraint):
         from cnpgen.kernels.symbolic.obstacle_distances import symbolic_solids
 
         # Axes of capsules: the radius is in the bound.
-        (segments, radii), solids = self._capsules(state), symbolic_solids(state)
+        segments, radii = self._capsules(state)
+        solids = symbolic_solids(state)
         distances = [
             solid.separation(a, b, state.freeze)
             for a, b in segments
@@ -128,7 +129,8 @@ class RobotClearance(DistanceConstraint):
         """State distances with better gradients: inside an obstacle, the depth of the center [m]."""
         from cnpgen.kernels.symbolic.obstacle_distances import symbolic_solids
 
-        (segments, radii), solids = self._capsules(state), symbolic_solids(state)
+        segments, radii = self._capsules(state)
+        solids = symbolic_solids(state)
         distances = [
             solid.smooth_separation(a, b, state.freeze)
             for a, b in segments

@@ -64,7 +64,8 @@ class Pose(TipManifold):
     @property
     def rotation(self) -> Array:
         """Required rotation, shape (3, 3)."""
-        (cr, cp, cy), (sr, sp, sy) = np.cos(self.rpy), np.sin(self.rpy)
+        cr, cp, cy = np.cos(self.rpy)
+        sr, sp, sy = np.sin(self.rpy)
         roll = np.array([[1, 0, 0], [0, cr, -sr], [0, sr, cr]])
         pitch = np.array([[cp, 0, sp], [0, 1, 0], [-sp, 0, cp]])
         yaw = np.array([[cy, -sy, 0], [sy, cy, 0], [0, 0, 1]])

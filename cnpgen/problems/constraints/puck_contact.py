@@ -209,10 +209,8 @@ class PuckContact(Constraint):
             if len(world.scene_values)
             else [PUCK_OUT_OF_REACH_M] * self.scene_width
         )
-        (x, y), (goal_x, goal_y, puck_x, puck_y) = (
-            world.parameters.on_table(world.tip_position)[:2],
-            values,
-        )
+        x, y = world.parameters.on_table(world.tip_position)[:2]
+        goal_x, goal_y, puck_x, puck_y = values
         return (x - goal_x) ** 2 + (y - goal_y) ** 2, np.hypot(x - puck_x, y - puck_y)
 
     def _condition(self, from_goal: Any, distance: Any) -> Conditions:

@@ -145,7 +145,8 @@ def origin_of(element: ElementTree.Element | None) -> tuple[Array, Array]:
 
 def turned(roll: float, pitch: float, yaw: float) -> Array:
     """Return the rotation by roll about x, then pitch about y, then yaw about z, fixed axes [rad], shape (3, 3)."""
-    (cr, cp, cy), (sr, sp, sy) = np.cos([roll, pitch, yaw]), np.sin([roll, pitch, yaw])
+    cr, cp, cy = np.cos([roll, pitch, yaw])
+    sr, sp, sy = np.sin([roll, pitch, yaw])
     return np.array(
         [
             [cy * cp, cy * sp * sr - sy * cr, cy * sp * cr + sy * sr],

@@ -164,7 +164,8 @@ class _Follower:
         self, q: Array, position: Array, period: float, anchor_velocity: Array
     ) -> Array | None:
         """Return the joint velocity that moves the tip to the sample, closest to the velocity of the anchor."""
-        robot, (tip, _, J) = self._robot, self._tip.at(q)
+        robot = self._robot
+        tip, _, J = self._tip.at(q)
         J = J[:3]
         # Velocity of minimum norm: J^T (J J^T)^-1 v.
         min_norm = J.T @ np.linalg.solve(J @ J.T, (position - tip) / period)

@@ -223,7 +223,8 @@ class Steering:
         shape (N, K, 3), and the numbers of states before the first invalid one, shape
         (N,).
         """
-        (q, dq), n = np.split(state, 2), len(self.limit)
+        q, dq = np.split(state, 2)
+        n = len(self.limit)
         ddq = np.repeat(
             controls[:, None, :n],
             round(self.spread.max_duration / STEERING_STEP_S),

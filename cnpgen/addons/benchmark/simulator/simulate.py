@@ -203,10 +203,8 @@ def simulator_scene(problem: Plans, plant: Plant) -> SimulatorScene:
     if scene.height is None:
         return scene
     if "puck_xy" in problem.columns:
-        puck, (vx, vy) = (
-            problem.columns["puck_xy"][0],
-            problem.columns["puck_velocity"][0].tolist(),
-        )
+        puck = problem.columns["puck_xy"][0]
+        vx, vy = problem.columns["puck_velocity"][0].tolist()
         return replace(scene, puck=puck, puck_velocity=(vx, vy))
     velocity = (
         Tip(robot).at(problem.boundary.goal_q[0])[2][:3] @ problem.boundary.goal_dq[0]
