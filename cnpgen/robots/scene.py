@@ -144,9 +144,7 @@ class Scene:
 
     def _check_sample(self, sample: int, argument: str) -> None:
         if not -len(self) <= sample < len(self):
-            text = (
-                f"there is no sample {sample}: {len(self)} samples are numbered from 0"
-            )
+            text = f"there is no sample {sample}: {counted(len(self), 'sample')}, numbered from 0"
             raise SampleIndexError(text, concerns=argument)
 
 
