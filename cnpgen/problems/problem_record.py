@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 from numpy.typing import ArrayLike
 
 from cnpgen.arrays import Array
-from cnpgen.errors import RecipeError, UsageError
+from cnpgen.errors import RecipeError, UsageError, counted
 from cnpgen.problems.objectives import read_objective
 from cnpgen.problems.problem import (
     FILES,
@@ -89,7 +89,7 @@ class ProblemRecord(StoredProblem):
                 raise UsageError(f"must be a text, got {text!r:.60}", argument=name)
 
     def __repr__(self) -> str:
-        return f"<ProblemRecord of {self.name!r}: {len(self.joint_names)} joints>"
+        return f"<ProblemRecord of {self.name!r}: {counted(len(self.joint_names), 'joint')}>"
 
     @cached_property
     def content(self) -> JsonObject:

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 from cnpgen.cli import values
 from cnpgen.cli.parser import Parser, refuse
-from cnpgen.errors import UsageError, listed
+from cnpgen.errors import UsageError, counted, listed
 
 if TYPE_CHECKING:
     from cnpgen.addons.trajectories.arm_registry import RecordedArm
@@ -225,7 +225,7 @@ def _lines(
         f"{sum(report.level == level for report in reports):,} {level}"
         for level in Level
     )
-    lines += ["", f"{path}: {len(reports):,} episodes: {counts}"]
+    lines += ["", f"{path}: {counted(len(reports), 'episode')}: {counts}"]
     if arm is not None:
         for quantity, limit in arm.limits.items():
             lines.append(

@@ -24,7 +24,7 @@ from cnpgen.addons.trajectories.trajectory_options import (
 from cnpgen.cli import values
 from cnpgen.cli.parser import Options, refuse
 from cnpgen.cli.terminal import Meter
-from cnpgen.errors import UsageError
+from cnpgen.errors import UsageError, counted
 
 if TYPE_CHECKING:
     from cnpgen.addons.trajectories.evaluate_trajectories import TrajectoryEvaluation
@@ -84,7 +84,7 @@ def run(arguments: argparse.Namespace) -> int:
     count = len(loaded.trajectories)
     if arguments.plan is not None and arguments.plan >= count:
         raise UsageError(
-            f"{arguments.file} has no trajectory {arguments.plan}: {count} are numbered from 0"
+            f"{arguments.file} has no trajectory {arguments.plan}: {counted(count, 'trajectory')}, numbered from 0"
         )
     with Meter(
         quiet=arguments.quiet or not sys.stderr.isatty(), noun="trajectory"
