@@ -64,10 +64,13 @@ def scene_of(
         parameters = None
     elif parameters is None:
         parameters = np.tile(problem.nominal_parameters, (len(start_xyz), 1))
-    if problem.scene_constraint is not None:
-        parts.append(
-            _constraint_values(problem, start_xyz, goal_xyz, goal_velocity, parameters)
-        )
+    if (constraint := problem.scene_constraint) is not None:
+        goal_velocity = _checked_velocity(problem, start_xyz, goal_xyz, goal_velocity)
+        # The puck lies on the table, whose frame differs from sample to sample.
+        if (frame := table_frame_of(problem, parameters)) is not None:
+            goal_velocity = frame.along_table(goal_velocity)
+            goal_xyz = frame.to_table(goal_xyz)
+        parts.append(constraint.scene_values(goal_xyz, goal_velocity))
     if parameters is not None:
         parts.append(parameters)
     if len(parts) == 1:
@@ -79,27 +82,21 @@ def scene_of(
     return scene if obstacle_poses is None else scene.with_poses(obstacle_poses)
 
 
-def _constraint_values(
-    problem: Problem,
-    start_xyz: Array,
-    goal_xyz: Array,
-    goal_velocity: Array | None,
-    parameters: Array | None,
+def _checked_velocity(
+    problem: Problem, start_xyz: Array, goal_xyz: Array, velocity: Array | None
 ) -> Array:
-    """Return the values that the scene's constraint depends on, such as a puck, shape (N, width)."""
-    assert problem.scene_constraint is not None
-    if goal_velocity is None:
-        text = f"is missing: the problem {problem.name!r} needs it"
-        raise UsageError(text, argument="goal_velocity")
-    shapes = [xyz.shape for xyz in (start_xyz, goal_xyz, goal_velocity)]
+    """Return the tip velocities at the goal, which a constraint on scenes needs, in the shape of the positions."""
+    if velocity is None:
+        raise UsageError(
+            f"is missing: the problem {problem.name!r} needs it",
+            argument="goal_velocity",
+        )
+    shapes = [xyz.shape for xyz in (start_xyz, goal_xyz, velocity)]
     if set(shapes) != {(len(start_xyz), 3)}:
-        text = f"positions and velocities must have one shape (N, 3), got {shapes}"
-        raise UsageError(text)
-    # The puck lies on the table, whose frame differs from sample to sample.
-    if (frame := table_frame_of(problem, parameters)) is not None:
-        goal_velocity = frame.along_table(goal_velocity)
-        goal_xyz = frame.to_table(goal_xyz)
-    return problem.scene_constraint.scene_values(goal_xyz, goal_velocity)
+        raise UsageError(
+            f"positions and velocities must have one shape (N, 3), got {shapes}"
+        )
+    return velocity
 
 
 def table_frame_of(problem: Problem, parameters: Array | None) -> TableFrame | None:

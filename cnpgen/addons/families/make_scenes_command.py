@@ -112,7 +112,8 @@ def run(arguments: argparse.Namespace) -> None:
     facts = {"file": str(out), "problems": len(scenes), "scenes": groups}
     if not arguments.quiet:
         text = f"{counted(len(scenes), 'problem')} in {counted(groups, 'scene')}"
-        text += f" with {min(obstacles)} to {max(obstacles)} obstacles"
+        fewest = f"{min(obstacles)} to " if min(obstacles) < max(obstacles) else ""
+        text += f" with {fewest}{counted(max(obstacles), 'obstacle')}"
         print(text, file=sys.stderr)
     print(json.dumps(facts, indent=2) if arguments.json else out)
 

@@ -15,6 +15,7 @@ from cnpgen.addons.init.stated_sources import INITIAL_JERK_RATE, PLACEHOLDERS
 from cnpgen.addons.manual.describe import link_rows, pair_rows, with_units
 from cnpgen.addons.manual.describe_keys import GROUPS, is_array, kind_summary, part_of
 from cnpgen.cli.terminal import table
+from cnpgen.errors import counted
 from cnpgen.make.recipe import DatasetRecipe
 from cnpgen.problems.load_robot import load_robot
 from cnpgen.robots.robot import Robot
@@ -142,7 +143,8 @@ def _facts(arm: Arm, robot: Robot) -> list[tuple[str, str]]:
     facts += [
         (
             "mass",
-            f"{mass:.4g} kg in {len(heavy)} links that move; without any: {', '.join(light) or 'none'}",
+            f"{mass:.4g} kg in {counted(len(heavy), 'moving link')}; "
+            f"moving links without mass: {', '.join(light) or 'none'}",
         )
     ]
     if not robot.chain.joints[-1].mass:

@@ -22,7 +22,12 @@ from cnpgen.addons.trajectories.parquet_tables import read_parquet
 from cnpgen.addons.trajectories.table_units import plain, stated_factor
 from cnpgen.addons.trajectories.trajectory_tables import read_trajectory_tables
 from cnpgen.arrays import Array
+<<<<<<< HEAD
 from cnpgen.errors import DatasetError, UsageError, listed
+=======
+from cnpgen.errors import DatasetError, UsageError, counted, listed
+from cnpgen.store.files.atomic import read_file
+>>>>>>> main
 from cnpgen.store.files.documents import parse_json
 from cnpgen.store.files.hdf5 import open_nested_hdf5
 from cnpgen.store.files.kind import HDF5_SUFFIXES
@@ -258,6 +263,6 @@ def chosen(recording: Recording, episodes: Sequence[int] | None) -> tuple[Episod
     found = [by_name.get(str(k)) or numbered.get(k) for k in episodes]
     missing = [k for k, episode in zip(episodes, found, strict=True) if episode is None]
     if missing:
-        text = f"there is no episode {missing[0]}: {len(recording.episodes)} are numbered from 0"
+        text = f"there is no episode {missing[0]}: {counted(len(recording.episodes), 'episode')}, numbered from 0"
         raise UsageError(text, concerns="episodes")
     return tuple(episode for episode in found if episode is not None)

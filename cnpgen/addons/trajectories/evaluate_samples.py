@@ -22,9 +22,10 @@ from cnpgen.addons.trajectories.trajectory_options import (
     write_json,
 )
 from cnpgen.cli import values
+from cnpgen.cli.evaluate_command import refuse_without_effect
 from cnpgen.cli.parser import Options, refuse
 from cnpgen.cli.terminal import Meter
-from cnpgen.errors import UsageError
+from cnpgen.errors import UsageError, counted
 
 if TYPE_CHECKING:
     from cnpgen.addons.trajectories.evaluate_trajectories import TrajectoryEvaluation
@@ -74,8 +75,7 @@ def run(arguments: argparse.Namespace) -> int:
         raise UsageError(
             "--tracking-error is for plans: --noise gives the error of sampled trajectories"
         )
-    if not arguments.plot:
-        refuse(arguments, ["plan"], "{} needs --plot")
+    refuse_without_effect(arguments)
     if arguments.ignore_velocities:
         refuse(arguments, ["velocities"], "{} has no effect with --ignore-velocities")
     problem = problem_of(arguments)
@@ -83,7 +83,7 @@ def run(arguments: argparse.Namespace) -> int:
     count = len(loaded.trajectories)
     if arguments.plan is not None and arguments.plan >= count:
         raise UsageError(
-            f"{arguments.file} has no trajectory {arguments.plan}: {count} are numbered from 0"
+            f"{arguments.file} has no trajectory {arguments.plan}: {counted(count, 'trajectory')}, numbered from 0"
         )
     found = _judged(arguments, loaded)
     if arguments.json:
