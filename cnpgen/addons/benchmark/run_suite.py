@@ -173,17 +173,10 @@ def run_benchmark(
     values = {name: _checked_parameters(name, given[name]) for name in planners}
     robots = _checked_plants(plants, chosen.environment)
     problems, prefix = loaded.problems(n)
-<<<<<<< HEAD
-    _check_environment(chosen.environment, problems)
-    seed = int(chosen.seed)
-    limit = float(chosen.time_limit)
-    setting = Setting(problems.problem, loaded.model, limit, seed)
-=======
     if chosen.environment is not None:
         check_challenge(*open_problem(problems.problem))
     seed = chosen.seed
     setting = Setting(problems.problem, loaded.model, chosen.time_limit, seed)
->>>>>>> main
     place = ResultsFolder(Path(folder), loaded, setting)
     names = {*place.planners(delete_others=force), *planners}
     _check_reference(chosen.reference, names)
@@ -195,12 +188,6 @@ def run_benchmark(
         for name in planners:
             run.compare(name, replace(setting, parameters=given[name]), values[name])
     return run.collected(loaded, planners, runs)
-
-
-def _check_environment(environment: str | Path | None, problems: Plans) -> None:
-    """Check that an environment of the challenge has the robot of the problems."""
-    if environment is not None:
-        check_challenge(*open_problem(problems.problem))
 
 
 def _check_reference(reference: str | None, names: set[str]) -> None:

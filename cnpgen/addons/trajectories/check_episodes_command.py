@@ -228,17 +228,9 @@ def _lines(
         first = f"  {report.findings[0]}" if report.findings else ""
         more = f"; {len(report.findings) - 1} more" if len(report.findings) > 1 else ""
         lines.append(f"{report.name:>8}  {report.level:<7}{first}{more}")
-<<<<<<< HEAD
     names = _by_level(reports)
     counts = ", ".join(f"{len(found):,} {level}" for level, found in names.items())
-    lines += ["", f"{path}: {len(reports):,} episodes: {counts}"]
-=======
-    counts = ", ".join(
-        f"{sum(report.level == level for report in reports):,} {level}"
-        for level in Level
-    )
     lines += ["", f"{path}: {counted(len(reports), 'episode')}: {counts}"]
->>>>>>> main
     if arm is not None:
         for quantity, limit in arm.limits.items():
             lines.append(

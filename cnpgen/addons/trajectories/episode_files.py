@@ -22,12 +22,7 @@ from cnpgen.addons.trajectories.parquet_tables import read_parquet
 from cnpgen.addons.trajectories.table_units import plain, stated_factor
 from cnpgen.addons.trajectories.trajectory_tables import read_trajectory_tables
 from cnpgen.arrays import Array
-<<<<<<< HEAD
-from cnpgen.errors import DatasetError, UsageError, listed
-=======
 from cnpgen.errors import DatasetError, UsageError, counted, listed
-from cnpgen.store.files.atomic import read_file
->>>>>>> main
 from cnpgen.store.files.documents import parse_json
 from cnpgen.store.files.hdf5 import open_nested_hdf5
 from cnpgen.store.files.kind import HDF5_SUFFIXES
