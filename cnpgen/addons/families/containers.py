@@ -4,9 +4,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import numpy as np
+from numpy.random import Generator
 
 from cnpgen.addons.families.furniture import Furniture, place_furniture
+from cnpgen.arrays import Vector3
 from cnpgen.pipelines.scene_family import Layout, SceneFamily, length, uniform, whole
 from cnpgen.schema.keys import Range, field
 
@@ -18,7 +19,7 @@ def _open_box(
     prefix: str,
     center: tuple[float, float],
     bottom: float,
-    size: tuple[float, float, float],
+    size: Vector3,
 ) -> None:
     """Add a bottom and four walls."""
     (x, y), (depth, width, height) = center, size
@@ -55,7 +56,7 @@ class OpenBox(SceneFamily):
         "number of cylinders in the box", default=Range(0, 2), low=0, high=10
     )
 
-    def draw(self, random: np.random.Generator) -> Layout:
+    def draw(self, random: Generator) -> Layout:
         """Draw the box, the cylinders and grasps inside of it."""
         box = place_furniture(random, self)
         width, depth, height = (
@@ -92,7 +93,7 @@ class Cage(SceneFamily):
         "height between the bars in front", Range(0.3, 0.42), low=0.15
     )
 
-    def draw(self, random: np.random.Generator) -> Layout:
+    def draw(self, random: Generator) -> Layout:
         """Draw walls, bars and an object in the cage."""
         cage = place_furniture(random, self, uniform(random, self.bottom))
         size = uniform(random, self.size)
@@ -133,7 +134,7 @@ class Dresser(SceneFamily):
     height: Range = length("height of a drawer", Range(0.12, 0.18), low=0.05)
     bottom: Range = length("height of the lower drawer's bottom", Range(0.05, 0.25))
 
-    def draw(self, random: np.random.Generator) -> Layout:
+    def draw(self, random: Generator) -> Layout:
         """Draw the body, the drawers side by side, and grasps in them."""
         dresser = place_furniture(random, self)
         width, height, bottom = (

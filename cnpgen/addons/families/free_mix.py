@@ -6,6 +6,7 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.random import Generator
 
 from cnpgen.pipelines.scene_family import (
     Grasp,
@@ -40,7 +41,7 @@ class FreeMix(SceneFamily):
     height: Range = length("heights of the centers", Range(0.05, 0.9))
     bearing: Range = angle("directions of the centers from the base", Range(-2.2, 2.2))
 
-    def draw(self, random: np.random.Generator) -> Layout:
+    def draw(self, random: Generator) -> Layout:
         """Draw the obstacles, and grasps between them in all directions."""
         obstacles = [
             self._obstacle(random, index) for index in range(whole(random, self.count))
@@ -64,7 +65,7 @@ class FreeMix(SceneFamily):
             )
         return Layout(tuple(obstacles), tuple(grasps))
 
-    def _obstacle(self, random: np.random.Generator, index: int) -> Obstacle:
+    def _obstacle(self, random: Generator, index: int) -> Obstacle:
         a, b, c = (uniform(random, self.size) for _ in range(3))
         share = random.random()
         bearing = uniform(random, self.bearing)

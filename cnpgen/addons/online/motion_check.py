@@ -12,10 +12,9 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from cnpgen.addons.online.set_points import SampledMotion, parts_of
-from cnpgen.arrays import Array
+from cnpgen.arrays import Array, Mask
 from cnpgen.judges.plans.measure import measure
 from cnpgen.plans.plans import Plans
 from cnpgen.problems.problem import Problem
@@ -96,7 +95,7 @@ class MotionChecker:
 
 def passed_parts(
     motion: SampledMotion, times: Array
-) -> Iterator[tuple[Plans, NDArray[np.bool_], Array]]:
+) -> Iterator[tuple[Plans, Mask, Array]]:
     """Yield the parts of its plan that a motion passes at K times [s], in their order.
 
     With each, return the mask of these times, shape (K,), and the phases of the part

@@ -23,7 +23,7 @@ from cnpgen.addons.online.hit_tasks import (
     lanes,
     state_lanes,
 )
-from cnpgen.arrays import Array
+from cnpgen.arrays import Array, Indices, Mask
 from cnpgen.errors import UsageError
 from cnpgen.pipelines.completion import Completion
 from cnpgen.pipelines.stages.stage import TaskBatch
@@ -36,6 +36,7 @@ from cnpgen.problems.constraints.puck_contact import (
 )
 from cnpgen.schema.argument_types import check_fields
 from cnpgen.schema.arguments import check_range, numbers
+from cnpgen.schema.tables import Names
 from cnpgen.trajectory.spline import basis
 
 HitArguments = tuple[
@@ -244,7 +245,7 @@ class MovingHits:
         self,
         time: Array,
         speed: Array,
-        rows: NDArray[np.intp],
+        rows: Indices,
         completion: Completion,
     ) -> TaskBatch:
         """Complete the tasks of some hits that meet the pucks at these times [s] with these speeds [m/s]."""
@@ -262,11 +263,11 @@ class MovingHits:
             angle=angle,
         )
 
-    def touching_at_start(self, completion: Completion) -> NDArray[np.bool_]:
+    def touching_at_start(self, completion: Completion) -> Mask:
         """Return which pucks touch the mallet in the state of the arm, shape (N,)."""
         start = completion.tip_positions(self.state[0].T)[:2].T
         distance = np.linalg.norm(self.puck - start, axis=1)
-        touching: NDArray[np.bool_] = distance < self.distance + self.overlap
+        touching: Mask = distance < self.distance + self.overlap
         return touching
 
     def with_pucks(self, plans: Plans, delay: Array) -> Plans:
@@ -298,7 +299,7 @@ def _of_one_length(parts: Mapping[str, Array]) -> dict[str, Array]:
 
 def plan_moving_hits(
     planner: Planner, completion: Completion, hits: MovingHits
-) -> tuple[Plans, tuple[str, ...], Array]:
+) -> tuple[Plans, Names, Array]:
     """Plan hits of moving pucks; return plans, reasons of the others, and waiting times before the plans [s].
 
     The earliest meeting time is a fixed point: the time of the contact in the plan to
@@ -330,7 +331,7 @@ def _planned(
     completion: Completion,
     hits: MovingHits,
     reasons: NDArray[np.object_],
-) -> tuple[NDArray[np.intp], Plans, Array, Array]:
+) -> tuple[Indices, Plans, Array, Array]:
     """Iterate the meeting times, and write the reasons of hits without an answer.
 
     Return the indices of the others, their plans, the times of their contacts, and the
@@ -365,7 +366,7 @@ def _planned(
 
 def _touched_early(
     completion: Completion, hits: MovingHits, plans: Plans, delay: Array
-) -> NDArray[np.bool_]:
+) -> Mask:
     """Return whether moving pucks touch the mallet before the meeting, while it waits (if not negative) or moves."""
     if not len(plans):
         return np.zeros(0, bool)
@@ -398,9 +399,7 @@ def _touched_early(
     return touched
 
 
-def _touching(
-    hits: MovingHits, rows: NDArray[np.intp], mallet: Array, time: Array
-) -> NDArray[np.bool_]:
+def _touching(hits: MovingHits, rows: Indices, mallet: Array, time: Array) -> Mask:
     """Return whether pucks touch mallets at positions, shape (P, K, 2), between times, shape (P, K)."""
     puck, velocity = (
         np.repeat(values[rows], time.shape[1], axis=0)
@@ -412,9 +411,7 @@ def _touching(
         - mallet
     )
     distance = distances_from_segments(np.zeros(2), relative[:, :-1], relative[:, 1:])
-    touching: NDArray[np.bool_] = (
-        distance < hits.distance + hits.overlap - MAX_EARLY_DEPTH_M
-    )
+    touching: Mask = distance < hits.distance + hits.overlap - MAX_EARLY_DEPTH_M
     return touching
 
 

@@ -8,7 +8,7 @@ from typing import Any
 from weakref import WeakKeyDictionary
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from cnpgen.addons.online.hit_tasks import (
     State,
@@ -17,7 +17,7 @@ from cnpgen.addons.online.hit_tasks import (
     load_completion,
 )
 from cnpgen.addons.online.moving_pucks import MovingHits, PuckModel, plan_moving_hits
-from cnpgen.arrays import Array
+from cnpgen.arrays import Array, Mask
 from cnpgen.errors import UsageError, counted
 from cnpgen.judges.plans.judge import Judge
 from cnpgen.machine.threads import one_thread
@@ -32,6 +32,7 @@ from cnpgen.problems.problem_record import as_problem, as_record, open_problem
 from cnpgen.schema.argument_types import check_fields, checked_arguments
 from cnpgen.schema.arguments import concerning, number, numbers
 from cnpgen.schema.old_keywords import CALLER, with_old_keywords
+from cnpgen.schema.tables import Names
 
 # From the centre of the paper's puck to that of its mallet at contact.
 
@@ -59,7 +60,7 @@ class PlannedHits:
     """
 
     plans: Plans
-    reasons: tuple[str, ...]
+    reasons: Names
     delay: Array
     overlap: float
     return_plans: Plans | None = None
@@ -214,7 +215,7 @@ def _plan_resting(
     speed_share: ArrayLike,
     distance: float,
     parameters: ArrayLike | None,
-) -> tuple[Plans, tuple[str, ...]]:
+) -> tuple[Plans, Names]:
     """Plan hits of pucks at rest at a contact distance [m]; return plans, and reasons of the others."""
     tasks = hit_tasks(
         *task, contact_distance=distance, share=speed_share, parameters=parameters
@@ -268,7 +269,7 @@ def _first_valid(
     return hits
 
 
-def _valid(judge: Judge, plans: Plans | None) -> NDArray[np.bool_]:
+def _valid(judge: Judge, plans: Plans | None) -> Mask:
     """Return which plans are valid by the independent verdict, shape (M,)."""
     if plans is None or not len(plans):
         return np.zeros(0, bool)

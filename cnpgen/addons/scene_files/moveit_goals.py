@@ -19,6 +19,7 @@ from cnpgen.addons.scene_files.moveit_frames import (
 from cnpgen.addons.scene_files.moveit_shapes import read_regions
 from cnpgen.arrays import Array
 from cnpgen.problems.scenes.scene_problem import GoalPose, SceneError
+from cnpgen.schema.tables import Names
 
 _PARAMETRIZATIONS = {"0": EULER, "XYZ_EULER_ANGLES": EULER}
 _PARAMETRIZATIONS |= {"1": ROTATION_VECTOR, "ROTATION_VECTOR": ROTATION_VECTOR}
@@ -35,7 +36,7 @@ class JointGoals:
 
 def read_start(
     state: Any, where: str, present: Mapping[str, float]
-) -> tuple[tuple[str, ...], Array, Array | None]:
+) -> tuple[Names, Array, Array | None]:
     """Return names, positions [rad] and velocities [rad/s] of the joints at the start.
 
     A state without joints is the present one, which the caller may know.
@@ -68,7 +69,7 @@ def read_start(
 
 
 def read_joint_goals(
-    goals: list[Any], joints: tuple[str, ...], start: Array, where: str
+    goals: list[Any], joints: Names, start: Array, where: str
 ) -> JointGoals:
     """Return the goal states of all alternatives with constraints of joints.
 
@@ -81,7 +82,7 @@ def read_joint_goals(
     return JointGoals(states, below, above)
 
 
-def _joint_goal(goal: Any, joints: tuple[str, ...], start: Array, where: str) -> Array:
+def _joint_goal(goal: Any, joints: Names, start: Array, where: str) -> Array:
     """Return joint positions of a goal and their tolerances below and above, shape (3, n)."""
     values = np.array([start, np.zeros_like(start), np.zeros_like(start)])
     constrained = set[str]()

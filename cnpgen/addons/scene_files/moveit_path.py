@@ -17,6 +17,7 @@ from cnpgen.addons.scene_files.link_constraints import (
 from cnpgen.addons.scene_files.moveit_frames import IDENTITY, FrameTable, frame_id
 from cnpgen.addons.scene_files.moveit_goals import check_weight, orientation_of
 from cnpgen.addons.scene_files.moveit_shapes import built, read_regions
+from cnpgen.arrays import Vector3
 from cnpgen.problems.constraints.constraint import LinkConstraint
 from cnpgen.problems.scenes.placement import moved_obstacle
 from cnpgen.problems.scenes.quaternions import roll_pitch_yaw
@@ -71,7 +72,7 @@ def _frame_and_link(entry: Any, where: str) -> tuple[str, str]:
     return frame_id(entry, where), link
 
 
-def _offset(entry: Any, where: str) -> tuple[float, float, float]:
+def _offset(entry: Any, where: str) -> Vector3:
     """Return the point of the link that a position constraint is about [m]."""
     value = entry.get("target_point_offset")
     x, y, z = (

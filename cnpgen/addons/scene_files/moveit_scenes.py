@@ -57,6 +57,7 @@ from cnpgen.problems.scenes.scene_problem import (
 from cnpgen.problems.scenes.scene_reader import ReadingOptions
 from cnpgen.problems.scenes.scene_request import SceneRequest
 from cnpgen.robots.obstacle import Obstacle
+from cnpgen.schema.tables import JsonMapping, Names
 from cnpgen.store.files.accounted import (
     MISSPELT,
     Account,
@@ -104,7 +105,7 @@ def read_moveit(
         yield _read_pair(scene_path, path, documents, options)
 
 
-def _hint(document: Mapping[str, Any], *missing: str) -> str:
+def _hint(document: JsonMapping, *missing: str) -> str:
     """Return the keys of a document that are probably a missing one, misspelt."""
     hints = (nearest(key, missing, similarity=MISSPELT) for key in document)
     found = [f"{key}{hint}" for key, hint in zip(document, hints, strict=True) if hint]
@@ -276,7 +277,7 @@ def _scales(request: AccountedMapping, where: str) -> tuple[float, float]:
 def _with_goals(
     request: AccountedMapping,
     where: str,
-    joints: tuple[str, ...],
+    joints: Names,
     start: Any,
     table: FrameTable,
 ) -> SceneProblem:

@@ -17,9 +17,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from cnpgen.arrays import Array
+from cnpgen.arrays import Array, Mask
 from cnpgen.problems.scenes.quaternions import quaternion_of
 from cnpgen.problems.scenes.scene_problem import (
     MAX_SCENES,
@@ -208,7 +207,7 @@ def _names(file: Hdf5, rows: slice, count: int) -> list[str]:
     return names
 
 
-def _is_present(kind: str, values: Array) -> NDArray[np.bool_]:
+def _is_present(kind: str, values: Array) -> Mask:
     """Return which entries are obstacles: those without a size of zero."""
     # Nan counts as a size.
     return np.asarray((values[:, : sum(_SHAPES[kind][1])] != 0).all(axis=1))

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING
 from cnpgen.cli import values
 from cnpgen.cli.parser import Parser, refuse
 from cnpgen.errors import UsageError, counted, listed
+from cnpgen.schema.tables import Names
 
 if TYPE_CHECKING:
     from cnpgen.addons.trajectories.arm_registry import RecordedArm
@@ -102,7 +103,7 @@ def _arm(arguments: argparse.Namespace, recording: "Recording") -> "RecordedArm 
     return arm
 
 
-def _numbers(texts: tuple[str, ...] | None) -> list[int] | None:
+def _numbers(texts: Names | None) -> list[int] | None:
     """Return the numbers of episodes."""
     if texts is None:
         return None
@@ -138,7 +139,7 @@ def _scale(
 
 
 def _columns(
-    names: tuple[str, ...] | None, arm: "RecordedArm", episode: "Episode"
+    names: Names | None, arm: "RecordedArm", episode: "Episode"
 ) -> tuple[int, ...]:
     """Return the column of each joint of an arm."""
     from cnpgen.addons.trajectories.episode_files import joint_name

@@ -11,9 +11,8 @@ from functools import cached_property
 from math import comb
 
 import numpy as np
-from numpy.typing import NDArray
 
-from cnpgen.arrays import Array
+from cnpgen.arrays import Array, Indices
 from cnpgen.judges.plans.bernstein import PiecewisePolynomials
 from cnpgen.judges.plans.evaluated_trajectory import EvaluatedTrajectory
 
@@ -94,7 +93,7 @@ class CurveFamily:
             (np.abs(self.coefficients).max(axis=0) + self.bounds[0]).max(axis=0)
         )
 
-    def _spans(self, s: Array) -> tuple[NDArray[np.intp], Array]:
+    def _spans(self, s: Array) -> tuple[Indices, Array]:
         """Return the span of every phase and the position in it, from 0 to 1."""
         span = np.clip(np.searchsorted(self.edges, s, "right") - 1, 0, len(self.t) - 2)
         low = self.edges[span]
@@ -117,7 +116,7 @@ def bernstein_basis(degree: int, u: Array) -> Array:
     )
 
 
-def _values(coefficients: Array, span: NDArray[np.intp], u: Array) -> Array:
+def _values(coefficients: Array, span: Indices, u: Array) -> Array:
     """Evaluate polynomials in their spans, shape (n, K)."""
     total = np.zeros((len(span), coefficients.shape[2]))
     basis = bernstein_basis(len(coefficients) - 1, u)

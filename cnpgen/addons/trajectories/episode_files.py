@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from cnpgen.addons.trajectories.lerobot_tables import (
     LEROBOT_ACTION,
@@ -21,8 +20,9 @@ from cnpgen.addons.trajectories.lerobot_tables import (
 from cnpgen.addons.trajectories.parquet_tables import read_parquet
 from cnpgen.addons.trajectories.table_units import plain, stated_factor
 from cnpgen.addons.trajectories.trajectory_tables import read_trajectory_tables
-from cnpgen.arrays import Array
+from cnpgen.arrays import Array, Integers
 from cnpgen.errors import DatasetError, UsageError, counted, listed
+from cnpgen.schema.tables import Names
 from cnpgen.store.files.documents import parse_json
 from cnpgen.store.files.hdf5 import open_nested_hdf5
 from cnpgen.store.files.kind import HDF5_SUFFIXES
@@ -54,8 +54,8 @@ class Episode:
     t: Array
     state: Array
     action: Array | None
-    names: tuple[str, ...]
-    frame: NDArray[np.int64]
+    names: Names
+    frame: Integers
     length: int | None = None
     has_units: bool = False
 

@@ -26,6 +26,7 @@ from cnpgen.cli.evaluate_command import refuse_without_effect
 from cnpgen.cli.parser import Options, refuse
 from cnpgen.cli.terminal import Meter
 from cnpgen.errors import UsageError, counted
+from cnpgen.schema.tables import Names
 
 if TYPE_CHECKING:
     from cnpgen.addons.trajectories.evaluate_trajectories import TrajectoryEvaluation
@@ -124,7 +125,7 @@ def _draw_trajectory(
     found: "TrajectoryEvaluation",
     picture: str,
     index: int | None,
-    labels: tuple[str, ...],
+    labels: Names,
 ) -> None:
     """Draw a trajectory, by default the first that is not valid, and mark its violations."""
     from cnpgen.addons.trajectories.trajectory_plot import plot_trajectory

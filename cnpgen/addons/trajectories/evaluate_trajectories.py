@@ -7,10 +7,9 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from cnpgen.addons.trajectories.curve_family import CurveFamily
 from cnpgen.addons.trajectories.interpolate import (
@@ -33,7 +32,7 @@ from cnpgen.addons.trajectories.trajectory_verdict import (
     Statement,
     TrajectoryVerdict,
 )
-from cnpgen.arrays import Array
+from cnpgen.arrays import Array, Mask
 from cnpgen.errors import UsageError, counted
 from cnpgen.judges.plans.judge import check_step
 from cnpgen.plans.evaluate import MAX_VERDICT_STEP_S, judged_in_parts
@@ -45,6 +44,7 @@ from cnpgen.robots.scene import Scene
 from cnpgen.robots.solid import pose_width
 from cnpgen.schema.argument_types import checked_arguments
 from cnpgen.schema.arguments import number, numbers
+from cnpgen.schema.tables import JsonObject
 from cnpgen.store.dataset_spec import StoredProblem
 
 FORMAT = "cnpgen-trajectory-evaluation"
@@ -95,7 +95,7 @@ class TrajectoryEvaluation:
         return dict(Counter(each.source for each in self.errors if each.source))
 
     @property
-    def valid(self) -> NDArray[np.bool_]:
+    def valid(self) -> Mask:
         """Whether each trajectory is proven to be valid, or a valid motion through it exists, shape (N,)."""
         return np.array([verdict.valid for verdict in self.verdicts], bool)
 
@@ -110,9 +110,9 @@ class TrajectoryEvaluation:
         """Who states the limits that were judged: quantity -> source."""
         return judged_sources(*open_problem(self.problem))
 
-    def summary(self) -> dict[str, Any]:
+    def summary(self) -> JsonObject:
         """Return the summary of all trajectories for JSON ('cnpgen docs trajectories')."""
-        conditions: dict[str, dict[str, Any]] = {}
+        conditions: dict[str, JsonObject] = {}
         for verdict in self.verdicts:
             for name, entry in verdict.conditions.items():
                 counts = conditions.setdefault(

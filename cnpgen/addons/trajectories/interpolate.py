@@ -5,7 +5,6 @@ from __future__ import annotations
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
 from cnpgen.addons.trajectories.curve_family import UNDEFINED, CurveFamily
 from cnpgen.addons.trajectories.sampled_trajectory import Trajectory
@@ -14,7 +13,7 @@ from cnpgen.addons.trajectories.span_polynomials import (
     hermite_polynomials,
     lagrange_polynomials,
 )
-from cnpgen.arrays import Array
+from cnpgen.arrays import Array, Indices
 from cnpgen.errors import UsageError
 
 Interpolation = Literal["hold", "linear", "cubic", "quintic"]
@@ -133,7 +132,7 @@ def data_of(trajectory: Trajectory) -> list[Array]:
     ]
 
 
-def _thinned(t: Array, max_jerk: float, noise: float) -> NDArray[np.intp]:
+def _thinned(t: Array, max_jerk: float, noise: float) -> Indices:
     """Choose samples whose distance minimizes the error of velocities: noise / h grows where max_jerk h^2 falls."""
     # Central differences of positions have an error of e / h + J h^2 / 6, smallest at h
     # = (3 e / J)^(1/3).

@@ -12,7 +12,6 @@ from itertools import chain, product
 from typing import TypeVar, cast
 
 import numpy as np
-from numpy.typing import NDArray
 
 from cnpgen.addons.trajectories.curve_family import ORDERS, UNDEFINED, CurveFamily
 from cnpgen.addons.trajectories.refuted_torques import TorqueLimit
@@ -24,7 +23,7 @@ from cnpgen.addons.trajectories.trajectory_verdict import (
     TrajectoryVerdict,
 )
 from cnpgen.addons.trajectories.uncertainty import uncertainty_of
-from cnpgen.arrays import Array
+from cnpgen.arrays import Array, Indices, Mask
 from cnpgen.judges.plans.bernstein import Maximum, find_maximum
 from cnpgen.judges.plans.continuous_collision import (
     check_continuous_collision,
@@ -311,7 +310,7 @@ def _doubt(margin: Margin, error: float) -> str:
     return f"{margin.name}: known up to {error:.2g} {margin.unit}, which some curves need to be valid"
 
 
-def _share(mask: NDArray[np.bool_], t: Array) -> float:
+def _share(mask: Mask, t: Array) -> float:
     """Return the share of time in which a condition holds at both ends of the intervals between times."""
     return float(np.diff(t) @ (mask[1:] & mask[:-1])) / float(t[-1])
 
@@ -390,7 +389,7 @@ def _sampled_violations(
     return np.asarray(highest), np.asarray((at - error_at).max(axis=1))
 
 
-def _sides(limits: ProvenJointLimits) -> NDArray[np.intp]:
+def _sides(limits: ProvenJointLimits) -> Indices:
     """Return the joints of the lower limits, then of the upper ones, shape (2 n,)."""
     n = len(limits.joints)
     return np.arange(2 * n) % n
@@ -461,7 +460,7 @@ def _certain(context: EvaluationContext, condition: MeasuredCondition) -> Array:
 
 def _violation_masks(
     context: EvaluationContext, condition: MeasuredCondition
-) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+) -> tuple[Mask, Mask]:
     """Return masks of the samples that every curve violates, and that some curve violates, shape (K,)."""
     if is_contact(condition.constraint):
         pairs = pairs_of(context.world, condition.constraint)

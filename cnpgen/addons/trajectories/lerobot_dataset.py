@@ -23,6 +23,7 @@ from cnpgen.addons.trajectories.lerobot_tables import (
 from cnpgen.errors import UsageError, requires_extra
 from cnpgen.plans.exporter import ExportedSet, Exporter, SampledPlan
 from cnpgen.plans.formats import fixed_lists, write_parquet
+from cnpgen.schema.tables import JsonObject
 from cnpgen.store.files.atomic import write_file
 
 Values = NDArray[Any]
@@ -187,7 +188,7 @@ def _write_episodes(
     lengths = np.array([len(episode["index"]) for episode in episodes])
     ends = np.cumsum(lengths)
     chunks = np.divmod(files, MAX_CHUNK_FILES)
-    table: dict[str, Any] = {
+    table: JsonObject = {
         "episode_index": np.arange(len(episodes)),
         "tasks": [[task]] * len(episodes),
         "length": lengths,
@@ -210,7 +211,7 @@ def _write_tasks(path: Path, task: str) -> None:
     import pyarrow
 
     index = "__index_level_0__"
-    columns: list[dict[str, Any]] = [
+    columns: list[JsonObject] = [
         {
             "name": "task_index",
             "field_name": "task_index",
@@ -260,9 +261,9 @@ def _statistics(columns: Mapping[str, Values]) -> dict[str, dict[str, list[float
 
 def _info(
     exported: ExportedSet, names: Mapping[str, list[str]], lengths: list[int]
-) -> dict[str, Any]:
+) -> JsonObject:
     """Return the description of the dataset."""
-    features: dict[str, Any] = {
+    features: JsonObject = {
         key: {"dtype": "float32", "shape": [len(values)], "names": values}
         for key, values in names.items()
     }

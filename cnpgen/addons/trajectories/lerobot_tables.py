@@ -17,6 +17,7 @@ from cnpgen.addons.trajectories.trajectory_table import (
 )
 from cnpgen.errors import UsageError, nearest
 from cnpgen.robots.parameter_ranges import PARAMETER_UNITS
+from cnpgen.schema.tables import JsonMapping, JsonObject
 from cnpgen.store.files.accounted import MISSPELT
 from cnpgen.store.files.atomic import read_file
 from cnpgen.store.files.documents import parse_json
@@ -95,20 +96,27 @@ def described(folder: Path, what: str) -> Iterator[None]:
     """Report that a description is not that of ``what`` if it cannot be read as such."""
     try:
         yield
-    except (ValueError, KeyError, TypeError, IndexError, StopIteration) as error:
+    except (
+        AttributeError,
+        ValueError,
+        KeyError,
+        TypeError,
+        IndexError,
+        StopIteration,
+    ) as error:
         raise UsageError(
             f"{folder / LEROBOT_INFO} does not describe {what}: {error!r:.200}",
             concerns="path",
         ) from error
 
 
-def read_description(folder: Path, what: str = DATASET) -> dict[str, Any]:
+def read_description(folder: Path, what: str = DATASET) -> JsonObject:
     """Return the description of a LeRobotDataset v3, which has ``features``."""
     with described(folder, what):
         content = read_file(folder / LEROBOT_INFO, max_bytes=MAX_TABLE_BYTES)
-        info: dict[str, Any] = parse_json(content.decode())
+        info: JsonObject = parse_json(content.decode())
         version = str(info["codebase_version"])
-        _ = info["features"].keys()
+        info["features"].keys()
     if not version.startswith("v3"):
         text = f"{folder} has LeRobot's format {version}, expected v3.0: convert it with LeRobot"
         raise UsageError(text, concerns="path")
@@ -144,15 +152,13 @@ def episodes_of(
             )
 
 
-def _unread_features(info: Mapping[str, Any], key: str) -> list[str]:
+def _unread_features(info: JsonMapping, key: str) -> list[str]:
     """Return the features beside that of the states, indices and the environment."""
     read = {key, *_INDICES, LEROBOT_ENVIRONMENT}
     return [name for name in info["features"] if name not in read]
 
 
-def _unknown(
-    info: Mapping[str, Any], names: Iterable[str], folder: Path
-) -> Iterator[str]:
+def _unknown(info: JsonMapping, names: Iterable[str], folder: Path) -> Iterator[str]:
     """Yield the unknown keys of a description and of the features that are read."""
     yield from _unknown_keys(info, _INFO_KEYS, "info.json", folder)
     for name in filter(info["features"].__contains__, names):

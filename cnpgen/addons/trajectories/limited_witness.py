@@ -11,7 +11,6 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from cnpgen.addons.trajectories.curve_family import CurveFamily
 from cnpgen.addons.trajectories.interpolate import data_of, family_of_data
@@ -24,7 +23,7 @@ from cnpgen.addons.trajectories.witness import (
     fitted,
     is_within,
 )
-from cnpgen.arrays import Array
+from cnpgen.arrays import Array, Indices
 
 if TYPE_CHECKING:
     from scipy.interpolate import BSpline
@@ -143,7 +142,7 @@ class _Part:
         return float(np.diff(self.t).mean())
 
     @property
-    def free(self) -> NDArray[np.intp]:
+    def free(self) -> Indices:
         """Indices of the coefficients whose supports are between both ends."""
         knots = self.spline.t
         index = np.arange(len(self.spline.c))

@@ -37,6 +37,7 @@ from cnpgen.robots.plausible_values import UnitError, find_implausible_value
 from cnpgen.robots.robot import Robot
 from cnpgen.schema.argument_types import checked_arguments
 from cnpgen.schema.old_keywords import with_old_keywords
+from cnpgen.schema.tables import AnyPath, Names
 from cnpgen.store.dataset_spec import StoredProblem
 from cnpgen.store.files.accounted import MISSPELT, check_allowed, unmatched
 
@@ -59,14 +60,14 @@ class LoadedTrajectories:
 
     problem: ProblemRecord
     trajectories: tuple[Trajectory, ...]
-    labels: tuple[str, ...]
-    ignored: tuple[str, ...]
-    notes: tuple[str, ...] = ()
+    labels: Names
+    ignored: Names
+    notes: Names = ()
 
 
 @checked_arguments
 def load_trajectories(
-    path: str | Path,
+    path: AnyPath,
     problem: Problem | StoredProblem | str | Path,
     *,
     joints: Sequence[str] | None = None,
@@ -130,7 +131,7 @@ def load_trajectories(
 
 
 def _read(
-    path: str | Path,
+    path: AnyPath,
     record: ProblemRecord,
     options: LoadOptions,
     names: tuple[Sequence[str], Sequence[str]],
@@ -168,7 +169,7 @@ def _extrapolated(
 
 
 def _check_trajectories(
-    path: str | Path,
+    path: AnyPath,
     options: LoadOptions,
     robot: Robot,
     trajectories: Sequence[Trajectory],
@@ -189,7 +190,7 @@ def _key_of(name: str) -> str:
 
 
 def _check_meaning(
-    path: str | Path, ignored: Iterable[str], allowed: Sequence[str]
+    path: AnyPath, ignored: Iterable[str], allowed: Sequence[str]
 ) -> None:
     """Refuse unused elements that say what numbers mean, unless their loss is accepted."""
     for name in ignored:
@@ -212,8 +213,8 @@ def _names(
     record: ProblemRecord,
     argument: str,
     names: Sequence[str] | None,
-    default: tuple[str, ...],
-) -> tuple[str, ...]:
+    default: Names,
+) -> Names:
     """Return names of columns, a different one for each joint of the problem, or a default."""
     if names is None:
         return default
@@ -231,7 +232,7 @@ def _names(
     return tuple(names)
 
 
-def _check_unit(path: str | Path, robot: Robot, positions: Sequence[Array]) -> None:
+def _check_unit(path: AnyPath, robot: Robot, positions: Sequence[Array]) -> None:
     """Check that positions are in rad or m, by their medians: single trajectories may be far outside of the limits."""
     median = np.median(np.concatenate(positions), axis=0)[None]
     wrong = find_implausible_value(robot, "q", median, robot.units("rad"))

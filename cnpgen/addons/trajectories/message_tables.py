@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from cnpgen.addons.trajectories.trajectory_table import TrajectoryTable
 from cnpgen.errors import UsageError
+from cnpgen.schema.tables import JsonMapping
 from cnpgen.store.files.accounted import (
     Account,
     UnusedElements,
@@ -129,7 +130,7 @@ def _tables(document: Any, place: str) -> Iterator[TrajectoryTable]:
         raise UsageError(f"{place}: expected {expected}, got {_kind(document)}")
 
 
-def _table_of_columns(document: Mapping[str, Any], place: str) -> TrajectoryTable:
+def _table_of_columns(document: JsonMapping, place: str) -> TrajectoryTable:
     """Return the table of an object of columns; single values are columns, too."""
     columns = {}
     for key, values in document.items():
@@ -143,7 +144,7 @@ def _table_of_columns(document: Mapping[str, Any], place: str) -> TrajectoryTabl
     return TrajectoryTable(place, columns, tuple(names or ()))
 
 
-def _check_message(message: Mapping[str, Any], place: str) -> None:
+def _check_message(message: JsonMapping, place: str) -> None:
     """Refuse motions of a base, attached objects, and responses of requests that failed."""
     for name in _OTHER_POINTS:
         other = message.get(name)
@@ -206,7 +207,7 @@ def _table_of_states(messages: Sequence[Any], place: str) -> TrajectoryTable:
 
 def _append(
     columns: dict[str, list[Any]],
-    point: Mapping[str, Any],
+    point: JsonMapping,
     fields: Mapping[str, str],
     rows: Sequence[int],
     where: str,
@@ -239,7 +240,7 @@ def _table_of_points(
     return TrajectoryTable(place, {MESSAGE_TIME: t, **found}, tuple(names))
 
 
-def _from_rows(rows: Sequence[Mapping[str, Any]], place: str) -> dict[str, Values]:
+def _from_rows(rows: Sequence[JsonMapping], place: str) -> dict[str, Values]:
     """Return the columns of a list of objects with the same keys."""
     for index, row in enumerate(rows):
         if row.keys() != rows[0].keys():
@@ -265,7 +266,7 @@ def _array(values: Any, place: str) -> Values:
     return found
 
 
-def _from_message(message: Mapping[str, Any], place: str) -> TrajectoryTable:
+def _from_message(message: JsonMapping, place: str) -> TrajectoryTable:
     """Return the points of a ``trajectory_msgs/JointTrajectory``, of ROS 1 or 2."""
     points = message["points"]
     names = _names(message.get("joint_names"), f"{place}: joint_names")

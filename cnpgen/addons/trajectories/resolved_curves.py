@@ -7,7 +7,6 @@ limits of the problem. Derivatives that the samples do not resolve have no bound
 """
 
 import numpy as np
-from numpy.typing import NDArray
 
 from cnpgen.addons.trajectories.curve_family import UNDEFINED, CurveFamily
 from cnpgen.addons.trajectories.interpolate import data_of
@@ -23,7 +22,7 @@ from cnpgen.addons.trajectories.span_polynomials import (
     hermite_polynomials,
     lagrange_polynomials,
 )
-from cnpgen.arrays import Array
+from cnpgen.arrays import Array, Mask
 
 # Samples that determine positions in a span, and fewer of them for the estimate of the
 # error.
@@ -121,9 +120,7 @@ def _with_neighbors(errors: Array) -> Array:
     return np.asarray(np.maximum(np.maximum(padded[:-2], padded[1:-1]), padded[2:]))
 
 
-def _unresolved_spans(
-    errors: Array, max_acceleration: Array, *, ends: bool
-) -> NDArray[np.bool_]:
+def _unresolved_spans(errors: Array, max_acceleration: Array, *, ends: bool) -> Mask:
     """Return a mask of the spans with large errors of accelerations, and of those at the ends, shape (S, n)."""
     # The negation counts nan as unresolved. Without a limit, any error is too large.
     mask = ~(

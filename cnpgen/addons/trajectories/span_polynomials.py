@@ -12,10 +12,9 @@ from dataclasses import dataclass
 from math import comb, factorial
 
 import numpy as np
-from numpy.typing import NDArray
 
 from cnpgen.addons.trajectories.curve_family import bernstein_basis
-from cnpgen.arrays import Array
+from cnpgen.arrays import Array, Indices
 
 KERNEL_NODES = 240  # of the integral over a kernel
 KERNEL_PHASES = 9  # in a span, at which the integral is evaluated
@@ -37,7 +36,7 @@ class SpanPolynomials:
 
     h: Array
     nodes: Array
-    orders: NDArray[np.intp]
+    orders: Indices
     weights: Array
     data: Array
     noise: Array

@@ -13,13 +13,12 @@ from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from cnpgen.addons.trajectories.curve_family import CurveFamily
 from cnpgen.addons.trajectories.interpolate import data_of, family_of_data
 from cnpgen.addons.trajectories.sample_errors import SampleErrors
 from cnpgen.addons.trajectories.sampled_trajectory import Trajectory
-from cnpgen.arrays import Array
+from cnpgen.arrays import Array, Mask
 
 if TYPE_CHECKING:
     from scipy.interpolate import BSpline
@@ -91,7 +90,7 @@ def fitted(
     # Columns of joints without a solution stay nan.
     chosen = np.full((len(equations.right), trajectory.q.shape[1]), np.nan)
 
-    def keep(exponent: float, candidates: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    def keep(exponent: float, candidates: Mask) -> Mask:
         """Store the solutions of candidates within the errors, and return which these are."""
         solution = equations.solve(exponent)
         if solution is None or not np.isfinite(solution).all():
@@ -208,7 +207,7 @@ def is_within(
 
 def _are_close(
     values: Sequence[Array], data: Sequence[Array], limits: Iterable[Any], axis: int
-) -> NDArray[np.bool_]:
+) -> Mask:
     """Return whether all given data are within limits of values along an axis."""
     close = [
         (np.abs(value - given) <= limit).all(axis=axis)
