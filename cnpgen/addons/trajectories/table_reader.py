@@ -365,7 +365,7 @@ class TableReader:
     def _note_order(self, columns: str) -> None:
         """Note that columns without names of joints are read in the problem's order."""
         names = self.record.joint_names
-        if self.options.joints != names:
+        if self.joints != names:
             raise self._error(
                 f"{columns} have no names of joints: {{joints}} must give their numbers",
                 remedies={"joints": None},
