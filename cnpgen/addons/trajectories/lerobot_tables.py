@@ -63,9 +63,8 @@ def read_lerobot(folder: Path) -> Iterator[TrajectoryTable]:
     widths = {"timestamp": 1, "episode_index": 1, key: len(names)}
     if parameters or scene:
         widths[LEROBOT_ENVIRONMENT] = len(places)
-    unused = [
-        name for name in features if name not in {key, *_INDICES, LEROBOT_ENVIRONMENT}
-    ]
+    used = {key, *_INDICES, LEROBOT_ENVIRONMENT}
+    unused = [name for name in features if name not in used]
     unused += [
         f"{LEROBOT_ENVIRONMENT} {name}"
         for k, name in enumerate(places)
@@ -89,9 +88,8 @@ def read_lerobot(folder: Path) -> Iterator[TrajectoryTable]:
         _check_rate(place, t, info.get("fps"))
         yield TrajectoryTable(place, columns, unused=tuple(unused))
     if (stated := info.get("total_frames", count)) != count:
-        raise UsageError(
-            f"{folder} has {count:,} frames, info.json states {stated!r:.60}"
-        )
+        text = f"{folder} has {count:,} frames, info.json states {stated!r:.60}"
+        raise UsageError(text)
 
 
 @contextmanager
