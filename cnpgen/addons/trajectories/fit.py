@@ -278,7 +278,7 @@ class _Fit:
 def _third_derivative(points: int, degree: int) -> Array:
     """Return rows of norm 1 that penalize p''': they select the smoothest path if the samples do not determine it."""
     rows = basis(chebyshev(4 * points), points, degree, 3)
-    return np.asarray(rows / np.linalg.norm(rows, 2))
+    return rows / np.linalg.norm(rows, 2)
 
 
 @cache
