@@ -62,8 +62,9 @@ def run(arguments: argparse.Namespace) -> int:
 def _print_url(page: Path) -> None:
     url = page_url(page)
     if url is None:
-        text = "the documentation has no address yet: 'cnpgen docs PAGE' prints a page"
-        raise UsageError(text)
+        raise UsageError(
+            "the documentation has no address yet: 'cnpgen docs PAGE' prints a page"
+        )
     print(url)
 
 

@@ -61,8 +61,7 @@ def add_options(parser: Parser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    if not arguments.plot:
-        refuse(arguments, ["plan"], "{} needs --plot")
+    refuse_without_effect(arguments)
     found = _evaluate(arguments)
     if arguments.json:
         _write_json(arguments.file, found)
@@ -73,6 +72,14 @@ def run(arguments: argparse.Namespace) -> int:
     if arguments.plot:
         _draw(found, arguments.plot, arguments.plan)
     return 0 if found.valid.all() else 1
+
+
+def refuse_without_effect(arguments: argparse.Namespace) -> None:
+    """Refuse options that have no effect on the output."""
+    if not arguments.plot:
+        refuse(arguments, ["plan"], "{} needs --plot")
+    if arguments.json:
+        refuse(arguments, ["list"], "{} has no effect with --json, which has all")
 
 
 def _evaluate(arguments: argparse.Namespace) -> "Evaluation":

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING
 from cnpgen.cli import recipe_names, values
 from cnpgen.cli.parser import Parser, add_json
 from cnpgen.cli.terminal import table
+from cnpgen.schema.tables import TextRows
 
 if TYPE_CHECKING:
     from cnpgen.store.field import Field
@@ -134,9 +135,7 @@ def _yield_lines(sampling: "SamplingStatistics") -> list[str]:
     ]
 
 
-def _field_rows(
-    field: "Field", found: "FieldStatistics | None"
-) -> list[tuple[str, ...]]:
+def _field_rows(field: "Field", found: "FieldStatistics | None") -> TextRows:
     """Return a row per column of a field.
 
     Its name is on the first one, its unit where it is not that of the last.

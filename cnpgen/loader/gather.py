@@ -64,8 +64,10 @@ def _checked(indices: ArrayLike, source: SplitShards) -> Indices:
     # As of lists, negative indices count from the end.
     wrong = (rows < -source.rows) | (rows >= source.rows)
     if wrong.any():
-        text = f"split {source.split!r} has {source.rows} rows, there is no row {rows[wrong][0]}"
-        raise RowError(text, concerns="indices")
+        raise RowError(
+            f"split {source.split!r} has {source.rows} rows, there is no row {rows[wrong][0]}",
+            concerns="indices",
+        )
     return np.where(rows < 0, rows + source.rows, rows).astype(np.int64)
 
 

@@ -3,7 +3,6 @@
 import hashlib
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -16,6 +15,7 @@ from cnpgen.pipelines.prepared import PreparedPipeline
 from cnpgen.problems.problem import resolved
 from cnpgen.robots.scene import scene_capacity
 from cnpgen.schema.arguments import check_memory, integer
+from cnpgen.schema.tables import JsonObject
 from cnpgen.store.dataset_spec import DatasetSpec, default_shard_size
 from cnpgen.store.workspace import Workspace
 
@@ -195,7 +195,7 @@ def _solved_tasks(
     return min(rows, requested)
 
 
-def _robot_record(prepared: PreparedPipeline) -> dict[str, Any]:
+def _robot_record(prepared: PreparedPipeline) -> JsonObject:
     robot = prepared.context.robot
     limits = {
         name: [float(x) for x in getattr(robot, name)]

@@ -8,8 +8,8 @@ from dataclasses import dataclass, fields, replace
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
+from cnpgen.arrays import Array
 from cnpgen.errors import DatasetError, RecipeError, UsageError, counted
 from cnpgen.plans.exporter import ExportedSet, Exporter, SampledPlan, sample_plan
 from cnpgen.plans.format import PlanStatus
@@ -198,9 +198,7 @@ def _write_each(
     return held
 
 
-def _environment(
-    plans: Plans | JoinedPlans, kept: list[int]
-) -> dict[str, NDArray[np.float64]]:
+def _environment(plans: Plans | JoinedPlans, kept: list[int]) -> dict[str, Array]:
     """Return goals, columns of the tasks and scenes of chosen plans, shape (N, w) each; of the last if joined."""
     last = _last(plans)
     columns = {

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from cnpgen.arrays import Array
+from cnpgen.arrays import Array, Integers
 from cnpgen.errors import UsageError, counted
 from cnpgen.plans.format import NOTES, PlanStatus
 from cnpgen.plans.plans import Plans, check_made
@@ -46,7 +46,7 @@ class JoinedPlans:
         return self.parts[0].problem
 
     @property
-    def sample_id(self) -> NDArray[np.int64]:
+    def sample_id(self) -> Integers:
         """Sample IDs of the first plans, shape (N,)."""
         return self.parts[0].sample_id
 

@@ -7,9 +7,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-from cnpgen.arrays import Array
+from cnpgen.arrays import Array, Mask
 from cnpgen.errors import UsageError, counted
 from cnpgen.problems.load_robot import load_robot
 from cnpgen.problems.problem import Problem
@@ -67,7 +67,7 @@ class ConstraintValues:
         return np.maximum(np.maximum(self.lower - self.g, self.g - self.upper), 0.0)
 
     @property
-    def valid(self) -> NDArray[np.bool_]:
+    def valid(self) -> Mask:
         """Whether each state satisfies every condition up to its tolerance, shape (N,)."""
         return np.asarray((self.violation <= self.tolerance).all(axis=1))
 
@@ -312,9 +312,7 @@ class RobotModel:
         )
 
     @checked_arguments
-    def is_collision_free(
-        self, q: ArrayLike, *, scene: Scene | None = None
-    ) -> NDArray[np.bool_]:
+    def is_collision_free(self, q: ArrayLike, *, scene: Scene | None = None) -> Mask:
         """Return whether nothing penetrates at each state, shape (N,).
 
         Arguments as of ``min_distance``.

@@ -111,8 +111,10 @@ def started_spec(workspace: Workspace, wanted: DatasetSpec) -> DatasetSpec | Non
             f"{workspace.damage}; {{force}} replaces the whole dataset",
             remedies={"force": True},
         )
-    text = f"{workspace.folder} {_describe_conflict(existing, wanted)}"
-    raise UsageError(text, remedies={"out": None, "force": True})
+    raise UsageError(
+        f"{workspace.folder} {_describe_conflict(existing, wanted)}",
+        remedies={"out": None, "force": True},
+    )
 
 
 def open_workspace(
@@ -148,8 +150,9 @@ def require_dataset_spec(folder: Path, spec: DatasetSpec) -> None:
         is_unchanged = spec.fingerprint.encode() in read_file(folder / SPECIFICATION)
     except DatasetError as error:
         missing = f"its {SPECIFICATION}" if folder.is_dir() else "it"
-        text = f"{folder}: {missing} was deleted or moved while the dataset was made; make it again"
-        raise MachineError(text) from error
+        raise MachineError(
+            f"{folder}: {missing} was deleted or moved while the dataset was made; make it again"
+        ) from error
     if not is_unchanged:
         raise _other_folder(
             f"{folder} was replaced by another dataset while this one was made"
@@ -265,8 +268,10 @@ def check_clearable(workspace: Workspace) -> list[Path]:
         named = [folder / split for split in spec.splits]
     splits = [split for split in named if split.is_dir()]
     if foreign := _foreign(folder, splits):
-        text = f"{folder} holds {foreign.relative_to(folder)}, which is not part of the dataset: move it away first"
-        raise UsageError(text)
+        raise UsageError(
+            f"{folder} holds {foreign.relative_to(folder)}, which is not part of the dataset: move it "
+            "away first"
+        )
     return splits
 
 

@@ -7,7 +7,6 @@ from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -23,6 +22,7 @@ from cnpgen.problems.problem_record import as_problem
 from cnpgen.problems.scenes.scene_problem import SceneError, SceneProblem
 from cnpgen.problems.scenes.scene_reader import holds_scenes, read_scenes
 from cnpgen.schema.arguments import concerning
+from cnpgen.schema.tables import JsonObject
 from cnpgen.store.dataset_spec import StoredProblem
 from cnpgen.store.scene_table import OBSTACLE_POSES
 from cnpgen.training.training_rows import TrainingProblems
@@ -45,7 +45,7 @@ class TrainingData(ABC):
 
     problem: StoredProblem
     place: str
-    stages: list[dict[str, Any]]
+    stages: list[JsonObject]
     n_validation: int
 
     @abstractmethod
@@ -53,7 +53,7 @@ class TrainingData(ABC):
         """Read all training rows."""
 
     @abstractmethod
-    def describe(self) -> dict[str, Any]:
+    def describe(self) -> JsonObject:
         """Return the identity of the rows, for the model's file."""
 
     def demonstrations(self, joints: int) -> ControlPoints | None:  # noqa: ARG002 - used by datasets
@@ -115,7 +115,7 @@ class DatasetRows(TrainingData):
         path, rate = (columns[name] for name in DEMONSTRATION)
         return ControlPoints(path.reshape(len(path), -1, joints), rate)
 
-    def describe(self) -> dict[str, Any]:
+    def describe(self) -> JsonObject:
         """Return the identity of the dataset."""
         spec = self.dataset.spec
         return {
@@ -174,7 +174,7 @@ class SceneRows(TrainingData):
         rows = slice(offset + first, offset + stop)
         return TrainingProblems(self.boundary[rows], self.obstacle_poses[rows])
 
-    def describe(self) -> dict[str, Any]:
+    def describe(self) -> JsonObject:
         """Return the identity of the problems."""
         digest = hashlib.sha256()
         for values in (

@@ -3,7 +3,6 @@
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -16,6 +15,7 @@ from cnpgen.make.make_shards import Job, blocks_of, prepare, shard_columns
 from cnpgen.make.recipe import DatasetRecipe, recipe_digest, resolved_digest, restored
 from cnpgen.schema.argument_types import checked_arguments
 from cnpgen.schema.arguments import integer
+from cnpgen.schema.tables import JsonObject
 from cnpgen.store.check import REPLACE_HINT, Finding, check_dataset
 from cnpgen.store.dataset_spec import (
     GENERATOR_REVISION,
@@ -107,7 +107,7 @@ def backend_of(folder: Path, spec: DatasetSpec) -> tuple[Backend, Path]:
         ) from error
 
 
-def _compare(stored: dict[str, Any], again: dict[str, Any]) -> tuple[bool, str]:
+def _compare(stored: JsonObject, again: JsonObject) -> tuple[bool, str]:
     """Return whether the values are bitwise identical, and the first difference above the tolerance."""
     same = all(np.array_equal(stored[name], values) for name, values in again.items())
     for name, values in again.items():
@@ -181,7 +181,7 @@ class ValidationReport:
         """Whether there are no findings except for notes."""
         return all(finding.note for finding in self.findings)
 
-    def to_dict(self) -> dict[str, Any]:
+    def to_dict(self) -> JsonObject:
         """Return the report for JSON."""
         return {
             "folder": str(self.folder),

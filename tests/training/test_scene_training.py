@@ -244,7 +244,7 @@ def test_the_gradient_is_the_sum_of_those_of_all_iterations(problem):
     parameters = initial_parameters(
         learner.architecture, seed=1, head_scale=1.0, rate_bias=-0.5
     )
-    weights, clipping = np.ones(len(run.names) - 1), Clipping()
+    weights, clipping = np.ones(len(run.loss.terms) - 1), Clipping()
 
     def gradient(learner, rows):
         out = np.empty_like(parameters)

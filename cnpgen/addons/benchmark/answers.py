@@ -7,7 +7,6 @@ which this curve lacks at its samples counts as violated.
 
 from dataclasses import replace
 from functools import lru_cache
-from typing import Any
 
 import numpy as np
 
@@ -34,9 +33,10 @@ from cnpgen.judges.plans.verdict import Margin, PaperRule, Reason, Verdict
 from cnpgen.plans.evaluate import evaluate_plans
 from cnpgen.plans.plans import Plans
 from cnpgen.problems.problem_record import ProblemRecord, open_problem
+from cnpgen.schema.tables import JsonObject
 from cnpgen.world.path import PathWorld
 
-Task = tuple[Plans, dict[str, Any], ExecutedPrefix | None]
+Task = tuple[Plans, JsonObject, ExecutedPrefix | None]
 """One boundary problem, the stored answer, and the executed prefix of a replanning scenario."""
 
 JUDGING_STEP_S = 1e-3

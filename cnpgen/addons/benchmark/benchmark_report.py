@@ -21,6 +21,7 @@ from cnpgen.addons.benchmark.simulator.rendering import save_film, save_picture
 from cnpgen.arrays import Array
 from cnpgen.errors import CnpgenError, MachineError, counted
 from cnpgen.schema.argument_types import checked_arguments
+from cnpgen.schema.tables import JsonObject
 from cnpgen.store.files.atomic import write_file
 from cnpgen.store.files.figure_file import new_figure, save_figure
 
@@ -244,7 +245,7 @@ def _motions(benchmark: Benchmark, *, video: bool) -> list[str]:
     return parts
 
 
-def _was_executed(row: dict[str, Any], plant: str) -> bool:
+def _was_executed(row: JsonObject, plant: str) -> bool:
     executed = row.get("executed", {}).get(plant)
     return executed is not None and "failure" not in executed
 

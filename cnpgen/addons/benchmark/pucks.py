@@ -6,7 +6,6 @@ its moving state.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -29,6 +28,7 @@ from cnpgen.problems.problem import Problem
 from cnpgen.refine.refine_plans import solve_plans
 from cnpgen.schema.arguments import integer
 from cnpgen.schema.keys import Range, field
+from cnpgen.schema.tables import NamedErrors
 from cnpgen.trajectory.spline_motion import Motion
 
 State = tuple[Array, Array, Array]
@@ -54,7 +54,7 @@ class Pucks:
         plausible=1.0,
     )
 
-    def validate(self) -> Iterator[tuple[str, str]]:
+    def validate(self) -> NamedErrors:
         """Yield (key, error) pairs."""
         if (count := self.columns * self.rows) > MAX_TASKS:
             yield (
@@ -128,7 +128,7 @@ class ReplanningScenario:
     )
     pucks: Pucks = field("grid of pucks of the first and of the second motion")
 
-    def validate(self) -> Iterator[tuple[str, str]]:
+    def validate(self) -> NamedErrors:
         """Yield (key, error) pairs."""
         if self.pucks.columns * self.pucks.rows % 2:
             yield (

@@ -85,8 +85,12 @@ def _add_outputs(parser: Parser) -> None:
         default=0,
         help="plan to draw (default: 0)",
     )
-    text = "draw the world at the end of one plan: .png"
-    option("--image", metavar="PICTURE", type=values.file_in(".png"), help=text)
+    option(
+        "--image",
+        metavar="PICTURE",
+        type=values.file_in(".png"),
+        help="draw the world at the end of one plan: .png",
+    )
     option(
         "--video",
         metavar="FILM",

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -30,12 +29,13 @@ from cnpgen.schema.arguments import integer
 from cnpgen.schema.catalogue import list_recipes, load_recipe, reference
 from cnpgen.schema.keys import NAME, RecipeLocation, field
 from cnpgen.schema.parsing import Reader, parse
+from cnpgen.schema.tables import JsonObject, NamedErrors
 from cnpgen.schema.toml import is_kind, read_table
 from cnpgen.schema.units import show
 
 DEFAULT_SAMPLES = 100
 
-PlannerFields = dict[str, dict[str, Any]]
+PlannerFields = dict[str, JsonObject]
 """Planner -> its field -> value, as in a recipe."""
 
 
@@ -86,7 +86,7 @@ class Suite:
         since_version=2,
     )
 
-    def validate(self) -> Iterator[tuple[str, str]]:
+    def validate(self) -> NamedErrors:
         """Yield (key, error) pairs."""
         if (
             sum(

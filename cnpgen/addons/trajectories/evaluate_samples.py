@@ -22,6 +22,7 @@ from cnpgen.addons.trajectories.trajectory_options import (
     write_json,
 )
 from cnpgen.cli import values
+from cnpgen.cli.evaluate_command import refuse_without_effect
 from cnpgen.cli.parser import Options, refuse
 from cnpgen.cli.terminal import Meter
 from cnpgen.errors import UsageError, counted
@@ -75,8 +76,7 @@ def run(arguments: argparse.Namespace) -> int:
         raise UsageError(
             "--tracking-error is for plans: --noise gives the error of sampled trajectories"
         )
-    if not arguments.plot:
-        refuse(arguments, ["plan"], "{} needs --plot")
+    refuse_without_effect(arguments)
     if arguments.ignore_velocities:
         refuse(arguments, ["velocities"], "{} has no effect with --ignore-velocities")
     problem = problem_of(arguments)

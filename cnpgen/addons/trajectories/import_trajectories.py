@@ -19,6 +19,7 @@ from cnpgen.addons.trajectories.evaluate_trajectories import (
 )
 from cnpgen.addons.trajectories.fit import fit_motion, largest_error
 from cnpgen.addons.trajectories.sampled_trajectory import Trajectory
+from cnpgen.addons.trajectories.samples import sampled_boundary
 from cnpgen.addons.trajectories.trajectory_scenes import problem_of_samples
 from cnpgen.arrays import Array
 from cnpgen.errors import UsageError
@@ -34,7 +35,6 @@ from cnpgen.schema.argument_types import checked_arguments
 from cnpgen.store.dataset_spec import StoredProblem
 from cnpgen.store.scene_table import OBSTACLE_POSES
 from cnpgen.trajectory.boundary import Boundary, join_boundaries
-from cnpgen.trajectory.samples import sampled_boundary
 from cnpgen.trajectory.spline_motion import Motion
 from cnpgen.trajectory.trajectory_spec import MAX_CONTROL_POINTS, TrajectorySpec
 from cnpgen.world.world import World

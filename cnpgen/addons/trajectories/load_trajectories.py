@@ -192,7 +192,7 @@ def _extrapolated(
     """Return the problem with ranges of parameters that contain those of the trajectories."""
     values = [each.parameters for each in trajectories]
     stated = [row for row in values if row is not None]
-    return extrapolated_record(record, np.array(stated)) if stated else record
+    return extrapolated_record(record, np.array(stated))
 
 
 def _check_trajectories(

@@ -12,6 +12,7 @@ from cnpgen.addons.trajectories.sampled_trajectory import Trajectory
 from cnpgen.addons.trajectories.table_columns import (
     KIND_NAMES,
     TIME_NAMES,
+    column_of,
     is_number,
     joint_columns,
     key_of,
@@ -378,7 +379,20 @@ class TableReader:
             raise self._error(
                 f"{name} has {width} columns, the problem plans {len(joints)} joints"
             )
+        self._note_order(f"the columns of {name}")
         return values
+
+    def _note_order(self, columns: str) -> None:
+        """Note that columns without names of joints are read in the problem's order."""
+        names = self.record.joint_names
+        if self.options.joints != names:
+            raise self._error(
+                f"{columns} have no names of joints: {{joints}} must give their numbers",
+                remedies={"joints": None},
+            )
+        self.notes.append(
+            f"columns without names of joints are read in the problem's order: {', '.join(names)}"
+        )
 
     def _scalar_columns(self, kind: str) -> list[str] | None:
         """Return the column of every joint, or None without any."""
@@ -390,6 +404,7 @@ class TableReader:
             if all(joint.isdecimal() for joint in joints):
                 return [self._named_column(joint, "joints") for joint in joints]
             first = int(self.options.rate is None)
+            self._note_order("columns without a head")
             return [str(k + first) for k in range(len(joints))]
         keys = {
             key_of(name): name
@@ -397,9 +412,12 @@ class TableReader:
             if values.ndim == 1
         }
         try:
-            return joint_columns(keys, joints, kind)
+            names = joint_columns(keys, joints, kind)
         except ValueError as error:
             raise self._error(str(error)) from error
+        if names and column_of(keys, joints[0], kind) is None:
+            self._note_order(f"the columns {names[0]!r} to {names[-1]!r}")
+        return names
 
     def _has_unit(self, kind: str) -> bool:
         """Return whether a column of a kind states its unit."""

@@ -170,7 +170,7 @@ def load_file(
 def write_json(
     file: Path, loaded: "LoadedTrajectories", found: "TrajectoryEvaluation"
 ) -> None:
-    """Write all verdicts, and what was not used of the file, as JSON."""
+    """Write all verdicts, what was not used of the file, and the notes of its reading, as JSON."""
     rows = [
         {"trajectory": index, "place": label, **verdict.to_dict()}
         for index, (label, verdict) in enumerate(
@@ -180,6 +180,7 @@ def write_json(
     document = {
         "file": str(file),
         "unused": list(loaded.ignored),
+        "notes": list(loaded.notes),
         **found.summary(),
         "verdicts": rows,
     }

@@ -19,7 +19,6 @@ import math
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from itertools import combinations
-from typing import Any
 
 import numpy as np
 
@@ -27,6 +26,7 @@ from cnpgen.arrays import Array
 from cnpgen.judges.rows.row_report import Check, Index, compare
 from cnpgen.problems.constraints.constraint import BOUNDARY_TOLERANCES
 from cnpgen.robots.robot import Robot
+from cnpgen.schema.tables import JsonMapping
 from cnpgen.world.measured_parameters import MeasuredParameters
 
 # Tolerance of the projected gradient of f [m^2/rad]. In float32 the joints have errors
@@ -60,7 +60,7 @@ class HitRule:
     full_speed: float | None = None
 
 
-def hit_rule(stages: Iterable[Mapping[str, Any]]) -> HitRule:
+def hit_rule(stages: Iterable[JsonMapping]) -> HitRule:
     """Read the rule for goals from resolved stages."""
     # The rule depends on two stages; other ones leave goals as they are.
     by_kind = {stage.get("use"): stage for stage in stages}

@@ -7,8 +7,8 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from cnpgen.arrays import Array
 from cnpgen.errors import RecipeError, UsageError
 from cnpgen.pipelines.scene_family import Layout, SceneFamily
 from cnpgen.pipelines.stages.batch_scenes import batch_scenes
@@ -108,7 +108,7 @@ class DrawScenes(Stage):
             concerns="recipe",
         )
 
-    def _shares(self) -> NDArray[np.float64]:
+    def _shares(self) -> Array:
         shares = np.array([family.share for family in self.family])
         # A sum of 0 is refused in ``_check``; here it only must not divide by zero.
         return np.asarray(shares / max(shares.sum(), 1e-300))
@@ -159,7 +159,7 @@ def _paused_garbage_collection() -> Iterator[None]:
             gc.enable()
 
 
-def base_depths(table: SceneTable) -> NDArray[np.float64]:
+def base_depths(table: SceneTable) -> Array:
     """Return the depth of the robot's base, the origin, in the obstacles of each scene [m], negative outside."""
     # R^T (0 - p): the origin in the frame of each obstacle; by symmetry its absolute
     # value.

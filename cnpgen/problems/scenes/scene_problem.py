@@ -243,8 +243,9 @@ def make_mesh(
 
 def _check_shape(argument: str, values: Array, shape: tuple[int, ...]) -> None:
     if values.shape != shape:
-        text = f"must have shape {shape}, got {values.shape}"
-        raise UsageError(text, argument=argument)
+        raise UsageError(
+            f"must have shape {shape}, got {values.shape}", argument=argument
+        )
 
 
 def is_rotation(matrix: Array) -> bool:

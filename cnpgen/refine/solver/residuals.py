@@ -21,6 +21,7 @@ from cnpgen.schema import registry
 from cnpgen.schema.catalogue import read_kind
 from cnpgen.schema.keys import RecipeLocation
 from cnpgen.schema.parsing import stored_values
+from cnpgen.schema.tables import JsonObject
 
 DISTANCE_SCALE_M = 0.1  # size of a residual of 1
 # Tolerances; with fewer the merit function rejects steps for equalities that are met
@@ -98,7 +99,7 @@ class CostTerm:
     terms: tuple[ObjectiveTerm, ...]  # of positive weight
 
     @property
-    def tables(self) -> list[dict[str, Any]]:
+    def tables(self) -> list[JsonObject]:
         """The kinds of the terms with their keys except the weight, JSON-able."""
         return [
             {key: value for key, value in resolved(term).items() if key != "weight"}
@@ -155,7 +156,7 @@ def choose_cost_term(
     return CostTerm(terms) if terms else None
 
 
-def cost_term_residuals(robot: Robot, terms: list[dict[str, Any]]) -> Any:
+def cost_term_residuals(robot: Robot, terms: list[JsonObject]) -> Any:
     """Build ``w -> (e, de/dw)`` of ``CostTerm.tables``, column by column, with ``w = (p, ..., p''', r, r', r'')``."""
     import casadi as ca
 
@@ -178,7 +179,7 @@ def _state(robot: Robot) -> tuple[Any, SymbolicState]:
     return w_sx, SymbolicState(robot, q, dq, ddq, [], (), None, jerk)
 
 
-def _restored(tables: list[dict[str, Any]]) -> list[ObjectiveTerm]:
+def _restored(tables: list[JsonObject]) -> list[ObjectiveTerm]:
     """Return the terms of ``CostTerm.tables``, of weight 1."""
     keys = [
         {key: value for key, value in table.items() if key not in {"source", "package"}}

@@ -24,16 +24,14 @@ from functools import cache
 from typing import Any, TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
 
-from cnpgen.arrays import Array
+from cnpgen.arrays import Array, Indices
 from cnpgen.kernels.kernel import Kernel
 from cnpgen.refine.solver.grid import Bases, Grid
 from cnpgen.refine.solver.residuals import CostTerm
 from cnpgen.trajectory.boundary import Boundary, assemble, boundary_derivatives
 from cnpgen.trajectory.trajectory_spec import TrajectorySpec
 
-Indices = NDArray[np.intp]
 T = TypeVar("T")
 # Weight of the squared second differences of log r, which selects one of many
 # parametrizations.

@@ -6,12 +6,10 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from cnpgen.arrays import Array
+from cnpgen.arrays import AnyArray, Array, Integers
 from cnpgen.errors import UsageError
 from cnpgen.robots.obstacle import Obstacle
 from cnpgen.robots.scene import PARKED_POSITION_M, Scene
@@ -141,7 +139,7 @@ class Primitives:
         meshes: The meshes of all bodies.
     """
 
-    kinds: NDArray[np.int64]
+    kinds: Integers
     centers: Array
     rotations: Array
     sizes: Array
@@ -150,7 +148,7 @@ class Primitives:
     def __len__(self) -> int:
         return len(self.kinds)
 
-    def __getitem__(self, which: int | slice | NDArray[Any]) -> Primitives:
+    def __getitem__(self, which: int | slice | AnyArray) -> Primitives:
         return Primitives(
             self.kinds[which],
             self.centers[which],
@@ -278,7 +276,7 @@ def padded(scenes: Sequence[Primitives]) -> Primitives:
     return Primitives(kinds, centers, rotations, sizes, tuple(meshes))
 
 
-def _padding(*shape: int) -> tuple[NDArray[np.int64], Array, Array, Array]:
+def _padding(*shape: int) -> tuple[Integers, Array, Array, Array]:
     """Return kinds, centers, rotations and sizes of rows of no bodies."""
     centers, sizes = np.zeros((2, *shape, 3))
     return (

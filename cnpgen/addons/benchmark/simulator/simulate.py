@@ -5,7 +5,6 @@ from contextlib import closing
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -29,6 +28,7 @@ from cnpgen.plans.tips import correct_tips
 from cnpgen.problems.problem_record import open_problem, with_payload_of
 from cnpgen.robots.table_frame import table_frame, upright_axes
 from cnpgen.schema.argument_types import checked_arguments
+from cnpgen.schema.tables import JsonObject
 
 SIMULATION_FORMAT = "cnpgen-simulation"
 SIMULATION_VERSION = 1
@@ -55,7 +55,7 @@ class Simulation:
         plans = f"{counted(len(self.executed), 'plan')} of {self.plans.problem.name!r}"
         return f"<{plans} executed by the {self.plant.name} plant, {succeeded:,} with success>"
 
-    def summary(self) -> dict[str, Any]:
+    def summary(self) -> JsonObject:
         """Return the summary of all plans for JSON."""
         rows = [result.to_dict() for result in self.executed]
         counts = {
@@ -203,10 +203,8 @@ def simulator_scene(problem: Plans, plant: Plant) -> SimulatorScene:
     if scene.height is None:
         return scene
     if "puck_xy" in problem.columns:
-        puck, (vx, vy) = (
-            problem.columns["puck_xy"][0],
-            problem.columns["puck_velocity"][0].tolist(),
-        )
+        puck = problem.columns["puck_xy"][0]
+        vx, vy = problem.columns["puck_velocity"][0].tolist()
         return replace(scene, puck=puck, puck_velocity=(vx, vy))
     velocity = (
         Tip(robot).at(problem.boundary.goal_q[0])[2][:3] @ problem.boundary.goal_dq[0]

@@ -1,0 +1,16 @@
+"""Types of tables: JSON objects, rows of text, and errors by names."""
+
+from collections.abc import Iterator, Mapping
+from typing import Any
+
+JsonObject = dict[str, Any]
+"""A table of a JSON or TOML document: name -> text, number, bool, None, list or table."""
+
+JsonMapping = Mapping[str, Any]
+"""A table of a JSON or TOML document that is only read."""
+
+TextRows = list[tuple[str, ...]]
+"""The cells of the rows of a printed table."""
+
+NamedErrors = Iterator[tuple[str, str]]
+"""(name, error) pairs of the keys of a table, or of the arguments of a call."""
