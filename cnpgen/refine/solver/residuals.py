@@ -114,25 +114,20 @@ class CostTerm:
         ]
         return np.array(rows, float)
 
-    def rate(self, e: Array, counts: Iterable[int]) -> tuple[Array, Array]:
-        """Evaluate the weighted size rho of the residuals e, shape (m, K), and its curvature.
+    def rate(self, e: Array, counts: Iterable[int]) -> Array:
+        """Evaluate the weighted size rho of the residuals e, shape (m, K): shape (K,).
 
-        ``counts`` are the numbers of residuals of every term. The result is ``(rho,
-        weight)``, shapes (K,) and (m, K): ``weight * e`` is the gradient of rho in e,
-        and the diagonal matrix of ``weight`` bounds its Hessian from above.
+        ``counts`` are the numbers of residuals of every term.
         """
         rho = np.zeros(e.shape[1])
-        weights = np.empty(e.shape)
         first = 0
         for count, smoothing, weight in self.groups(counts).tolist():
             part = slice(first, first := first + int(count))
             squares = np.sum(e[part] * e[part], axis=0)
-            # rho = w (sqrt(e.e + s^2) - s) or w e.e; weights are those of d rho =
-            # weights e . de.
+            # rho = w (sqrt(e.e + s^2) - s) or w e.e
             size = np.sqrt(squares + smoothing**2)
             rho += weight * (size - smoothing if smoothing > 0 else squares)
-            weights[part] = weight / size if smoothing > 0 else 2.0 * weight
-        return rho, weights
+        return rho
 
 
 def choose_cost_term(
