@@ -28,7 +28,7 @@ from cnpgen.robots.urdf_parameters import (
     UrdfParameters,
     urdf_parameters,
 )
-from cnpgen.schema.tables import Names
+from cnpgen.schema.tables import NamedNumbers, Names
 
 # Ranges to either side, where the URDF has none.
 DEFAULT_RANGE_RAD = math.pi
@@ -67,14 +67,14 @@ class Arm:
     locked: Names  # names of all other joints that move: they stay at zero
     moved: Names  # links that planned joints move
     frames: Names  # names of all links and joints
-    masses: Mapping[str, float]  # link -> mass [kg]; 0 where it has none
+    masses: NamedNumbers  # link -> mass [kg]; 0 where it has none
     # Links that planned joints move with inertias that no body has.
     impossible: Names
     shaped: Names  # links that have a ``<collision>`` element
     meshes: Names  # mesh files that links name
     visual: Names  # links that have a ``<visual>`` and no ``<collision>``
     # Locked joints that do not stay at zero -> position [rad or m].
-    locked_positions: Mapping[str, float]
+    locked_positions: NamedNumbers
     doubts: Names  # sentences about numbers that are probably wrong
     friction: tuple[JointFriction, ...]  # friction of planned joints that have any
     joint_notes: Names  # about further elements of planned joints

@@ -10,7 +10,7 @@ from typing import Any
 from cnpgen.addons.init.arm import Arm, ArmJoint
 from cnpgen.errors import UsageError, nearest
 from cnpgen.problems.scenes.yaml_document import read_yaml
-from cnpgen.schema.tables import Names
+from cnpgen.schema.tables import NamedNumbers, Names
 
 _LIMITS = {  # flag -> the keys that it switches on
     "has_position_limits": ("min_position", "max_position"),
@@ -27,7 +27,7 @@ class StatedJointLimits:
     """Limits of a file for the joints of an arm, by joint and key; only those whose flag is true."""
 
     path: Path
-    values: Mapping[str, Mapping[str, float]]
+    values: Mapping[str, NamedNumbers]
     unused: Names = ()  # sentences about elements of the file
 
     def of(self, key: str) -> dict[str, float]:

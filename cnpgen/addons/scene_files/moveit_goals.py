@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -19,7 +18,7 @@ from cnpgen.addons.scene_files.moveit_frames import (
 from cnpgen.addons.scene_files.moveit_shapes import read_regions
 from cnpgen.arrays import Array
 from cnpgen.problems.scenes.scene_problem import GoalPose, SceneError
-from cnpgen.schema.tables import Names
+from cnpgen.schema.tables import NamedNumbers, Names
 
 _PARAMETRIZATIONS = {"0": EULER, "XYZ_EULER_ANGLES": EULER}
 _PARAMETRIZATIONS |= {"1": ROTATION_VECTOR, "ROTATION_VECTOR": ROTATION_VECTOR}
@@ -35,7 +34,7 @@ class JointGoals:
 
 
 def read_start(
-    state: Any, where: str, present: Mapping[str, float]
+    state: Any, where: str, present: NamedNumbers
 ) -> tuple[Names, Array, Array | None]:
     """Return names, positions [rad] and velocities [rad/s] of the joints at the start.
 

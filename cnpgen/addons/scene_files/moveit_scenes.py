@@ -9,7 +9,7 @@ fixed transform. Every element is read, refused by name, or one of ``moveit_unus
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -57,7 +57,7 @@ from cnpgen.problems.scenes.scene_problem import (
 from cnpgen.problems.scenes.scene_reader import ReadingOptions
 from cnpgen.problems.scenes.scene_request import SceneRequest
 from cnpgen.robots.obstacle import Obstacle
-from cnpgen.schema.tables import JsonMapping, Names
+from cnpgen.schema.tables import JsonMapping, NamedNumbers, Names
 from cnpgen.store.files.accounted import (
     MISSPELT,
     Account,
@@ -158,7 +158,7 @@ def _problem(
     scene: AccountedMapping,
     path: Path,
     request: AccountedMapping,
-    present: Mapping[str, float],
+    present: NamedNumbers,
 ) -> SceneProblem:
     name = re.sub(r"^(scene|request)[_-]?", "", path.stem) or path.stem
     place = f"{scene_path}: scene {name!r}"

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from pathlib import Path
@@ -37,7 +37,7 @@ from cnpgen.robots.plausible_values import UnitError, find_implausible_value
 from cnpgen.robots.robot import Robot
 from cnpgen.schema.argument_types import checked_arguments
 from cnpgen.schema.old_keywords import with_old_keywords
-from cnpgen.schema.tables import AnyPath, Names
+from cnpgen.schema.tables import AnyPath, NamedNumbers, Names
 from cnpgen.store.dataset_spec import StoredProblem
 from cnpgen.store.files.accounted import MISSPELT, check_allowed, unmatched
 
@@ -72,7 +72,7 @@ def load_trajectories(
     *,
     joints: Sequence[str] | None = None,
     velocities: Sequence[str] | None = None,
-    parameters: Mapping[str, float] | None = None,
+    parameters: NamedNumbers | None = None,
     scenes: str | Path | Sequence[SceneProblem] | None = None,
     options: LoadOptions | None = None,
     **old_keywords: Any,
@@ -135,7 +135,7 @@ def _read(
     record: ProblemRecord,
     options: LoadOptions,
     names: tuple[Sequence[str], Sequence[str]],
-    parameters: Mapping[str, float],
+    parameters: NamedNumbers,
 ) -> tuple[list[TableReader], tuple[Trajectory, ...]]:
     """Return the readers of the tables of a file, with the names of joints and of their velocities, and trajectories."""
     robot = open_problem(record)[1]
@@ -308,7 +308,7 @@ def _of_stack(table: TrajectoryTable, index: int, count: int) -> TrajectoryTable
     )
 
 
-def _check_parameters(record: ProblemRecord, parameters: Mapping[str, float]) -> None:
+def _check_parameters(record: ProblemRecord, parameters: NamedNumbers) -> None:
     """Check the names of stated parameters."""
     known = record.parameters.names
     for name in parameters:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -33,6 +33,7 @@ from cnpgen.arrays import Array
 from cnpgen.errors import UsageError, listed, nearest
 from cnpgen.plans.format import PHASE_COLUMN
 from cnpgen.problems.problem_record import ProblemRecord
+from cnpgen.schema.tables import NamedNumbers
 from cnpgen.store.scene_table import OBSTACLE_POSES
 
 UNUSED_KINDS = ("jerk", "effort", "efforts")  # not reported as ignored
@@ -56,7 +57,7 @@ class TableReader:
     options: LoadOptions
     joints: Sequence[str]
     velocities: Sequence[str]
-    parameters: Mapping[str, float]
+    parameters: NamedNumbers
     velocity_limit: Array
     used: set[str] = field(default_factory=set)
     notes: list[str] = field(default_factory=list)
