@@ -181,7 +181,7 @@ def _chosen(
     chosen = set(arguments.plan or ())
     if chosen and max(chosen) >= len(plans):
         raise UsageError(
-            f"there is no plan {max(chosen)}: {len(plans)} plans are numbered from 0"
+            f"there is no plan {max(chosen)}: {counted(len(plans), 'plan')}, numbered from 0"
         )
     if arguments.sample is not None:
         missing = np.setdiff1d(arguments.sample, plans.sample_id)

@@ -20,7 +20,7 @@ from cnpgen.cli import recipe_names, values
 from cnpgen.cli.parser import Parser, options_of
 from cnpgen.cli.terminal import LINE_WIDTH, Meter
 from cnpgen.cli.train_options import add_settings, changed_settings, passed_settings
-from cnpgen.errors import MachineError
+from cnpgen.errors import MachineError, counted
 from cnpgen.schema.tables import JsonMapping
 
 if TYPE_CHECKING:
@@ -94,7 +94,9 @@ class Watch:
         self._last = step
         parameters = run.learner.architecture.n_parameters
         self._meter.begin(
-            f"training {parameters:,} parameters on {len(run.rows):,} rows", steps, step
+            f"training {parameters:,} parameters on {counted(len(run.rows), 'row')}",
+            steps,
+            step,
         )
         wanted = run.learner.settings.batch_size
         taken = run.order.batch_size

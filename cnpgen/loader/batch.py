@@ -11,7 +11,7 @@ from itertools import chain
 import numpy as np
 
 from cnpgen.arrays import AnyArray
-from cnpgen.errors import DatasetError
+from cnpgen.errors import DatasetError, counted
 from cnpgen.loader.row_format import Columns, Normalization
 from cnpgen.loader.shard_reader import problem_obstacles
 from cnpgen.problems.scenes.observe import MAX_SEED, Scenes, observe
@@ -47,7 +47,7 @@ class Batch(Mapping[str, AnyArray]):
     observations: Mapping[str, AnyArray] = field(default_factory=dict)
 
     def __repr__(self) -> str:
-        return f"<batch of {self.rows} rows, {self.table.dtype}: {self.layout.summary}>"
+        return f"<batch of {counted(self.rows, 'row')}, {self.table.dtype}: {self.layout.summary}>"
 
     @property
     def columns(self) -> dict[str, slice]:

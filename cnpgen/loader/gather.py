@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from cnpgen.errors import UsageError
+from cnpgen.errors import UsageError, counted
 from cnpgen.loader.row_format import Columns, RowFormat
 from cnpgen.loader.shard_reader import Rows, SplitShards
 from cnpgen.schema.arguments import reject_masked
@@ -106,7 +106,7 @@ class Split:
     row_format: RowFormat
 
     def __repr__(self) -> str:
-        return f"<{self.source.rows:,} rows of split {self.source.split!r}: {self.row_format.layout.summary}>"
+        return f"<{counted(self.source.rows, 'row')} of split {self.source.split!r}: {self.row_format.layout.summary}>"
 
     def __len__(self) -> int:
         return self.source.rows

@@ -114,7 +114,7 @@ class SolvedScenes:
     times: Times = NO_TIME
 
     def __repr__(self) -> str:
-        return f"<{len(self.scenes)} scenes of {self.plans.problem.name!r}, {int(self.valid.sum())} solved>"
+        return f"<{counted(len(self.scenes), 'scene')} of {self.plans.problem.name!r}, {int(self.valid.sum())} solved>"
 
     @property
     def valid(self) -> Mask:

@@ -254,21 +254,21 @@ class InferencePipeline:
         return outputs, rows(path, tasks.boundary.start_q.shape[1])
 
     def _fitted(self, motion: Motion, obstacle_poses: Array) -> Motion:
-        # Uniform time scaling slows those motions that are still beyond their limits.
-        violating = np.arange(len(motion))
+        beyond_limits: slice | NDArray[np.bool_] = slice(None)
         if self.time_parametrization is not None:
             motion, meets_limits = self.time_parametrization.parametrize(
                 motion, obstacle_poses
             )
-            violating = np.flatnonzero(~meets_limits)
-        if self.time_scaling is None or not len(violating):
+            beyond_limits = ~meets_limits
+        if self.time_scaling is None:
             return motion
+        # Uniform time scaling slows those motions that are still beyond their limits.
         factor = np.ones(len(motion))
-        factor[violating] = self.time_scaling.factor(
-            motion[violating], obstacle_poses[violating]
+        factor[beyond_limits] = self.time_scaling.factor(
+            motion[beyond_limits], obstacle_poses[beyond_limits]
         )
         # A factor of 1 leaves the rates to the bit.
-        return motion if factor.max() <= 1 else motion.time_scaled(factor)
+        return motion if factor.max(initial=1.0) <= 1 else motion.time_scaled(factor)
 
     def _with_via_points(
         self, via_points: ViaPoints, model: Model, tasks: Tasks, motion: Motion

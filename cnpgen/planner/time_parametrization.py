@@ -38,6 +38,7 @@ from cnpgen.planner.expressions import (
 from cnpgen.planner.time_scaling import PhaseGrid, make_phase_grid
 from cnpgen.problems.problem import Problem
 from cnpgen.robots.robot import Robot
+from cnpgen.schema.unchecked import unchecked
 from cnpgen.trajectory.spline_motion import Motion
 
 SOURCE = Path(__file__).with_name("time_parametrization.c")
@@ -130,9 +131,8 @@ class TimeParametrization(PhaseGrid):
             np.empty(len(motion)),
         )
         self._fit(motion.path, obstacle_poses, rate, violation)
-        return Motion(
-            motion.path, rate, motion.degree
-        ), violation <= self.violation_tolerance
+        fitted = unchecked(Motion, motion.path, rate, motion.degree)
+        return fitted, violation <= self.violation_tolerance
 
     @cached_property
     def relaxed_bounds(self) -> tuple[Array, Array]:

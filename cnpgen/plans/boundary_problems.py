@@ -362,7 +362,7 @@ def _of_file(
         wanted,
         content="boundary problems",
         command="solve",
-        parameters=file.columns.get("parameters") if extrapolate else None,
+        parameters=file.columns.get("parameters", ()) if extrapolate else None,
     )
     recorded = file.text("problem_sha256")
     if recorded and recorded != problem.comparable_sha256:

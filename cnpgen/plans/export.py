@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from cnpgen.arrays import Array
-from cnpgen.errors import DatasetError, RecipeError, UsageError
+from cnpgen.errors import DatasetError, RecipeError, UsageError, counted
 from cnpgen.plans.exporter import ExportedSet, Exporter, SampledPlan, sample_plan
 from cnpgen.plans.format import PlanStatus
 from cnpgen.plans.join import JoinedPlans
@@ -237,7 +237,7 @@ def _chosen(plans: Plans | JoinedPlans, only: Sequence[int] | None) -> list[int]
     for index in chosen:
         if not 0 <= index < len(plans):
             raise UsageError(
-                f"there is no plan {index}: {len(plans)} plans are numbered from 0",
+                f"there is no plan {index}: {counted(len(plans), 'plan')}, numbered from 0",
                 concerns="only",
             )
     return chosen

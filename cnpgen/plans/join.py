@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from cnpgen.arrays import Array, Integers
-from cnpgen.errors import UsageError
+from cnpgen.errors import UsageError, counted
 from cnpgen.plans.format import NOTES, PlanStatus
 from cnpgen.plans.plans import Plans, check_made
 from cnpgen.problems.problem_record import ProblemRecord
@@ -38,7 +38,7 @@ class JoinedPlans:
         return len(self.parts[0])
 
     def __repr__(self) -> str:
-        return f"<{len(self)} sequences of {len(self.parts)} plans of {self.problem.name!r}>"
+        return f"<{counted(len(self), 'sequence')} of {counted(len(self.parts), 'plan')} of {self.problem.name!r}>"
 
     @property
     def problem(self) -> ProblemRecord:

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from cnpgen.arrays import AnyArray, Columns, Integers
 from cnpgen.errors import DatasetError, RecipeError, UsageError, nearest
@@ -109,7 +109,7 @@ def load_plans(
         wanted,
         content="plans",
         command="evaluate",
-        parameters=columns.get("parameters") if extrapolate else None,
+        parameters=columns.get("parameters", ()) if extrapolate else None,
     )
     with errors_of_file(path):
         plans = _assembled(path, record, columns, attributes)
@@ -213,7 +213,7 @@ def agreed_problem(
     *,
     content: str,
     command: str,
-    parameters: AnyArray | None = None,
+    parameters: ArrayLike | None = None,
 ) -> ProblemRecord:
     """Return the problem of a file: the required one if it is consistent, or the file's own.
 

@@ -378,7 +378,7 @@ def _checked(which: Any, plans: int) -> slice | AnyArray:
     elif found.size and not -plans <= int(found.min()) <= int(found.max()) < plans:
         wrong = int(found.max() if found.max() >= plans else found.min())
         raise PlanIndexError(
-            f"there is no plan {wrong}: {plans} plans are numbered from 0",
+            f"there is no plan {wrong}: {counted(plans, 'plan')}, numbered from 0",
             concerns="which",
         )
     return np.atleast_1d(found)

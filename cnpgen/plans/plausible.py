@@ -30,11 +30,8 @@ def check_boundary_units(
     Raises:
         UnitError: A value is probably in another unit.
     """
-    columns = {
-        name: np.asarray(values) for name, values in boundary.conditions().items()
-    }
     try:
-        check_units_of_states(robot, columns, noun="plan")
+        check_units_of_states(robot, boundary.conditions(), noun="plan")
     except UnitError as error:
         text = f"{where}: {error}" if where else str(error)
         if allow_large_angles:

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 from numpy.typing import ArrayLike
 
 from cnpgen.arrays import Array
-from cnpgen.errors import RecipeError, UsageError
+from cnpgen.errors import RecipeError, UsageError, counted
 from cnpgen.problems.objectives import read_objective
 from cnpgen.problems.problem import (
     FILES,
@@ -89,7 +89,7 @@ class ProblemRecord(StoredProblem):
                 raise UsageError(f"must be a text, got {text!r:.60}", argument=name)
 
     def __repr__(self) -> str:
-        return f"<ProblemRecord of {self.name!r}: {len(self.joint_names)} joints>"
+        return f"<ProblemRecord of {self.name!r}: {counted(len(self.joint_names), 'joint')}>"
 
     @cached_property
     def content(self) -> JsonObject:
@@ -286,11 +286,14 @@ def extrapolated(problem: Problem, parameters: ArrayLike) -> Problem:
     """Return a problem whose ranges contain values of its parameters, shape (N, p), with a name that marks it.
 
     A problem whose ranges contain them already is returned unchanged. UsageError is
-    raised for values that no range may contain.
+    raised for values that no range may contain, and for a problem without parameters.
     """
     ranges = problem.parameters
+    if not len(ranges):
+        text = f"has no effect: the problem {problem.name!r} has no parameters"
+        raise UsageError(text, argument="extrapolate")
     rows = numbers("parameters", parameters)
-    if not len(ranges) or rows.ndim not in {1, 2} or rows.shape[-1] != len(ranges):
+    if rows.ndim not in {1, 2} or rows.shape[-1] != len(ranges):
         # Errors of the shape are those of the reader.
         return problem
     wider = ranges.widened(rows.reshape(-1, len(ranges)))

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from cnpgen.arrays import Array, Mask
-from cnpgen.errors import UsageError
+from cnpgen.errors import UsageError, counted
 from cnpgen.problems.load_robot import load_robot
 from cnpgen.problems.problem import Problem
 from cnpgen.problems.problem_record import as_problem
@@ -136,7 +136,7 @@ class RobotModel:
         self._world: World | None = None
 
     def __repr__(self) -> str:
-        return f"<RobotModel of {self.problem.name!r}: {len(self.joint_names)} joints, tip {self.tip!r}>"
+        return f"<RobotModel of {self.problem.name!r}: {counted(len(self.joint_names), 'joint')}, tip {self.tip!r}>"
 
     @checked_arguments
     def forward_kinematics(self, q: ArrayLike) -> tuple[Array, Array]:

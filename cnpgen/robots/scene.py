@@ -144,7 +144,7 @@ class Scene:
     def _check_sample(self, sample: int, argument: str) -> None:
         if not -len(self) <= sample < len(self):
             raise SampleIndexError(
-                f"there is no sample {sample}: {len(self)} samples are numbered from 0",
+                f"there is no sample {sample}: {counted(len(self), 'sample')}, numbered from 0",
                 concerns=argument,
             )
 

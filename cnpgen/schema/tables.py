@@ -1,6 +1,7 @@
 """Types of tables: JSON objects, rows of text, and errors by names."""
 
 from collections.abc import Iterator, Mapping
+from pathlib import Path
 from typing import Any
 
 JsonObject = dict[str, Any]
@@ -14,3 +15,9 @@ TextRows = list[tuple[str, ...]]
 
 NamedErrors = Iterator[tuple[str, str]]
 """(name, error) pairs of the keys of a table, or of the arguments of a call."""
+
+Names = tuple[str, ...]
+"""Names of joints, columns, links or keys, in their order."""
+
+AnyPath = str | Path
+"""A path of a file or folder, as a caller may pass it."""

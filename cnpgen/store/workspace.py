@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
-from cnpgen.errors import DatasetError, MachineError, UsageError
+from cnpgen.errors import DatasetError, MachineError, UsageError, counted
 from cnpgen.store.dataset_spec import (
     INFORMATIONAL,
     DatasetSpec,
@@ -231,7 +231,7 @@ def _setting(difference: Difference) -> str:
 
 def _sizes(spec: DatasetSpec) -> str:
     splits = ", ".join(f"{split} {rows:,}" for split, rows in spec.splits.items())
-    return f"{sum(spec.splits.values()):,} rows ({splits})"
+    return f"{counted(sum(spec.splits.values()), 'row')} ({splits})"
 
 
 def _cleared(workspace: Workspace) -> Workspace:

@@ -29,7 +29,7 @@ from cnpgen.cli.parser import (
     refuse_others,
 )
 from cnpgen.cli.terminal import Meter, table
-from cnpgen.errors import CnpgenError, UsageError
+from cnpgen.errors import CnpgenError, UsageError, counted
 from cnpgen.schema.tables import JsonObject
 
 if TYPE_CHECKING:
@@ -289,7 +289,7 @@ def _text(found: "Benchmark") -> str:
         table_rows,
     )
 
-    head = f"{found.suite.name} {found.suite.version}: {len(found.problems)} problems"
+    head = f"{found.suite.name} {found.suite.version}: {counted(len(found.problems), 'problem')}"
     tables = [
         table([(*row, "") for row in table_rows(found, plant)], indent="  ")
         for plant in found.executions

@@ -19,7 +19,7 @@ from cnpgen.addons.benchmark.run_suite import Benchmark
 from cnpgen.addons.benchmark.simulator.plant import Plant
 from cnpgen.addons.benchmark.simulator.rendering import save_film, save_picture
 from cnpgen.arrays import Array
-from cnpgen.errors import CnpgenError, MachineError
+from cnpgen.errors import CnpgenError, MachineError, counted
 from cnpgen.schema.argument_types import checked_arguments
 from cnpgen.schema.tables import JsonObject
 from cnpgen.store.files.atomic import write_file
@@ -171,8 +171,9 @@ def save_benchmark_report(
     """
     suite = benchmark.suite
     place = Path(path)
+    size = counted(len(benchmark.problems), "problem")
     parts = [
-        f"<h1>{escape(suite.name)} {suite.version}</h1><p>{escape(suite.title)}: {len(benchmark.problems)} problems</p>"
+        f"<h1>{escape(suite.name)} {suite.version}</h1><p>{escape(suite.title)}: {size}</p>"
     ]
     parts += [
         f"<p>{escape(text)}</p>"

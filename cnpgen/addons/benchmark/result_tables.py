@@ -16,6 +16,7 @@ from cnpgen.addons.benchmark.hypothesis_tests import (
     values_of,
 )
 from cnpgen.addons.benchmark.run_suite import Benchmark
+from cnpgen.errors import counted
 from cnpgen.schema.argument_types import checked_arguments
 from cnpgen.schema.tables import JsonMapping, JsonObject, TextRows
 from cnpgen.store.files.atomic import write_file
@@ -310,7 +311,8 @@ def latex_text(benchmark: Benchmark) -> str:
             for row in zip(*table_rows(benchmark, plant), strict=True)
         ]
         (_, *head), *planners = rows
-        caption = f"{suite.title or suite.name}: {len(benchmark.problems)} problems of {suite.name} {suite.version}"
+        size = counted(len(benchmark.problems), "problem")
+        caption = f"{suite.title or suite.name}: {size} of {suite.name} {suite.version}"
         caption += f", executed by the {plant} plant." if plant else "."
         label = f"tab:{suite.name}{f'-{plant}' if plant else ''}"
         lines += [

@@ -30,7 +30,7 @@ from cnpgen.addons.benchmark.simulator.execute import load_mujoco
 from cnpgen.addons.benchmark.simulator.executed import PLANE_TOLERANCE_M
 from cnpgen.addons.benchmark.simulator.plant import Plant, as_plant
 from cnpgen.addons.benchmark.suite import PlannerFields, Suite, load_suite
-from cnpgen.errors import RecipeError, UsageError
+from cnpgen.errors import RecipeError, UsageError, counted
 from cnpgen.judges.plans.verdict import Verdict
 from cnpgen.machine.engine import Engine, WorkerPool, assembled
 from cnpgen.plans.plans import Plans
@@ -84,7 +84,7 @@ class Benchmark:
     plane_tolerance: float = PLANE_TOLERANCE_M
 
     def __repr__(self) -> str:
-        return f"<{self.suite.name}: {len(self.problems)} problems, {', '.join(self.results)}>"
+        return f"<{self.suite.name}: {counted(len(self.problems), 'problem')}, {', '.join(self.results)}>"
 
     @property
     def executions(self) -> tuple[str, ...]:

@@ -108,7 +108,7 @@ def run(arguments: argparse.Namespace) -> int:
     plans = recipe_names.read_plans(arguments.file, problem=arguments.problem)
     if arguments.plan >= len(plans):
         raise UsageError(
-            f"{arguments.file} has no plan {arguments.plan}: {len(plans)} plans are numbered from 0"
+            f"{arguments.file} has no plan {arguments.plan}: {counted(len(plans), 'plan')}, numbered from 0"
         )
     with Meter(quiet=arguments.quiet or not sys.stderr.isatty(), noun="plan") as meter:
         meter.begin(f"executing {arguments.file}", len(plans))

@@ -45,6 +45,7 @@ from cnpgen.robots.urdf import read_urdf, urdf_tree
 from cnpgen.robots.urdf_changes import SRDF_NAMES
 from cnpgen.robots.urdf_elements import unknown_names
 from cnpgen.schema.keys import PerJoint, Range
+from cnpgen.schema.tables import Names
 from cnpgen.store.files.accounted import check_allowed
 
 # Range of inverse kinematics guesses around the base configuration.
@@ -63,7 +64,7 @@ class InitialProblem:
     problem: Problem
     arm: Arm  # with placeholders of missing limits
     overlaps: LinkOverlaps | None  # None without link geometry
-    notes: tuple[str, ...]
+    notes: Names
 
 
 def problem_of(
@@ -73,8 +74,8 @@ def problem_of(
     packages: tuple[Path, ...],
     srdf: Path | None,
     *,
-    skipped_meshes: tuple[str, ...] = (),
-    allow_unused: tuple[str, ...] = (),
+    skipped_meshes: Names = (),
+    allow_unused: Names = (),
     joint_limits: StatedJointLimits | None = None,
 ) -> InitialProblem:
     """Make the problem of an arm, or raise RecipeError if it cannot be planned for.
@@ -115,7 +116,7 @@ def problem_of(
     return InitialProblem(problem, arm, overlaps, every)
 
 
-def _with_torque(problem: Problem, robot: Robot) -> tuple[Problem, tuple[str, ...]]:
+def _with_torque(problem: Problem, robot: Robot) -> tuple[Problem, Names]:
     """Return a problem with the limit of torques, or a note of the reason why it is omitted."""
     # Torques of links without masses are meaningless.
     if not robot.chain.joints[-1].mass > 0:
@@ -127,7 +128,7 @@ def _with_torque(problem: Problem, robot: Robot) -> tuple[Problem, tuple[str, ..
     return replace(problem, constraint=constraints), ()
 
 
-def _check_allowed(keys: tuple[str, ...], urdf: Path, srdf: Path | None) -> None:
+def _check_allowed(keys: Names, urdf: Path, srdf: Path | None) -> None:
     """Raise UsageError for names that neither file has as those of parts that are not read."""
     unread = unknown_names(urdf_tree(read_urdf(urdf)))
     if srdf is not None and keys:
@@ -163,7 +164,7 @@ def _problem(
     packages: tuple[Path, ...],
     srdf: Path | None,
     *,
-    skipped_meshes: tuple[str, ...],
+    skipped_meshes: Names,
 ) -> Problem:
     """Return the problem without torques, with the base configuration at the centre of all limits."""
     centre = tuple((joint.lower + joint.upper) / 2 for joint in arm.planned)

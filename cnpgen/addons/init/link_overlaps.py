@@ -13,6 +13,7 @@ from cnpgen.robots.shape.inline import mesh_links
 from cnpgen.robots.shape.link_pairs import LinkPair
 from cnpgen.robots.urdf import read_urdf
 from cnpgen.robots.urdf_changes import with_collision_geometry
+from cnpgen.schema.tables import Names
 
 # Fraction of the free states that convex parts may reject without further
 # decomposition.
@@ -36,7 +37,7 @@ class LinkOverlaps:
     problem: Problem
     hulls: HullGap
     parts: HullGap
-    notes: tuple[str, ...]
+    notes: Names
 
 
 def resolve_overlaps(problem: Problem) -> LinkOverlaps:

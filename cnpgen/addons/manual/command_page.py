@@ -28,7 +28,8 @@ def command_page() -> str:
             escaped(command.description),
             *_tables(command),
         ]
-        parts += [f"```\n{command.epilog.strip()}\n```"] if command.epilog else []
+        paragraphs = (command.epilog or "").split("\n\n")
+        parts += [escaped(" ".join(text.split())) for text in paragraphs if text]
     codes = str(parser.epilog).partition("Exit codes:\n")[2]
     rows = [
         " ".join(row.split()).partition(" ")

@@ -5,7 +5,7 @@ from pathlib import Path
 
 from cnpgen.cli.parser import Parser, add_json
 from cnpgen.cli.terminal import table
-from cnpgen.errors import RecipeError
+from cnpgen.errors import RecipeError, counted
 from cnpgen.schema.tables import JsonObject
 from cnpgen.schema.toml import Kind
 
@@ -102,7 +102,7 @@ def _dataset(name: str, _: Path) -> JsonObject:
         "version": recipe.version,
         "pipeline": recipe.pipeline.name,
     }
-    return about | {"size": f"{rows:,} rows", "rows": rows, "splits": recipe.splits}
+    return about | {"size": counted(rows, "row"), "rows": rows, "splits": recipe.splits}
 
 
 def _model(name: str, file: Path) -> JsonObject:
@@ -126,7 +126,7 @@ def _pipeline(name: str, _: Path) -> JsonObject:
     return {
         "title": recipe.title,
         "problem": recipe.problem.name,
-        "size": f"{count} stages",
+        "size": counted(count, "stage"),
         "stages": count,
     }
 

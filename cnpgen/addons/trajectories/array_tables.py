@@ -14,6 +14,7 @@ from cnpgen.errors import UsageError
 from cnpgen.plans.format import PHASE_COLUMN
 from cnpgen.plans.stated_units import UNIT_ATTRIBUTES
 from cnpgen.robots.parameter_ranges import PARAMETER_UNITS
+from cnpgen.schema.tables import Names
 from cnpgen.store.files.archives import ArchiveError, read_arrays
 from cnpgen.store.files.hdf5 import open_hdf5
 
@@ -75,7 +76,7 @@ def read_hdf5_tables(path: Path, _: LoadOptions) -> Iterator[TrajectoryTable]:
 
 
 def _split(
-    path: Path, arrays: dict[str, Values], names: tuple[str, ...]
+    path: Path, arrays: dict[str, Values], names: Names
 ) -> Iterator[TrajectoryTable]:
     """Yield the trajectories of an archive: ``plan_00000_t`` and so on, or ``t`` and ``q`` of all."""
     parts: dict[str, dict[str, Values]] = {}

@@ -33,6 +33,7 @@ from cnpgen.addons.trajectories.refuted_limits import (
     BOTH,
     VELOCITIES,
     RefutedLimit,
+    absolute_limits,
     largest_values,
     refuted_limits,
 )
@@ -48,7 +49,6 @@ from cnpgen.addons.trajectories.trajectory_verdict import (
 )
 from cnpgen.addons.trajectories.velocity_by_position import VelocityByPosition
 from cnpgen.addons.trajectories.witness import witness
-from cnpgen.arrays import Array
 from cnpgen.judges.plans.bernstein import find_maximum
 from cnpgen.judges.plans.joint_limits import ProvenJointLimits, quantity_of
 from cnpgen.judges.plans.judge import MAX_STEP_S
@@ -94,16 +94,12 @@ def refute(
 
 
 def judge_samples(
-    judge: FamilyJudge,
-    trajectory: Trajectory,
-    errors: SampleErrors,
-    *,
-    scene: Array | None = None,
+    judge: FamilyJudge, trajectory: Trajectory, errors: SampleErrors
 ) -> TrajectoryVerdict:
     """Judge the motion that samples resolve.
 
     Jitter must be part of the errors of the values (``with_jitter``) but for the curves
-    that meet samples within it. For the scene see ``FamilyJudge``.
+    that meet samples within it.
     """
     limits = judge.limits(trajectory.parameters)
     ends = acceleration_limits(limits)
@@ -114,7 +110,7 @@ def judge_samples(
     for curve, step in tries:
         excess = _joint_limit_excess(curve, limits)
         if excess is None:
-            verdict = judge(curve, trajectory, scene=scene, step=step)
+            verdict = judge(curve, trajectory, step=step)
             if verdict.valid:
                 return verdict
             excess = ""
@@ -131,10 +127,10 @@ def judge_samples(
     if exact and _is_dense(trajectory):
         line = interpolated(trajectory, "linear", noise)
         smooth = through_positions(trajectory, SMOOTH_NEIGHBORS)
-        found = judge(line, trajectory, scene=scene, smooth=smooth)
+        found = judge(line, trajectory, smooth=smooth)
         return _assuming(LINES, found, detail)
     family = resolved_curves(trajectory, noise, ends.acceleration)
-    return _assuming(RESOLUTION, judge(family, trajectory, scene=scene), detail)
+    return _assuming(RESOLUTION, judge(family, trajectory), detail)
 
 
 def _assuming(
@@ -162,19 +158,11 @@ def acceleration_limits(
     limits: ProvenJointLimits, tolerance_share: float = TOLERANCE_SHARE
 ) -> AccelerationLimits:
     """Return the smallest acceleration and jerk limits of a problem with most of their tolerances."""
-    n = len(limits.joints)
-    smallest = {"ddq": np.full(n, np.inf), "jerk": np.full(n, np.inf)}
-    for constraint, bounds, tolerance in zip(
-        limits.constraints, limits.bounds, limits.tolerance, strict=True
-    ):
-        quantity = quantity_of(constraint)
-        if quantity in smallest:
-            # Limits of both signs may differ, and the curve uses one number for both.
-            allowed = np.minimum(-bounds[:n], bounds[n:]) + tolerance_share * tolerance
-            smallest[quantity] = np.minimum(
-                smallest[quantity], np.maximum(allowed, 0.0)
-            )
-    return AccelerationLimits(smallest["ddq"], smallest["jerk"])
+    # Limits of both signs may differ, and the curve uses one number for both.
+    smallest = absolute_limits(limits, np.minimum, tolerance_share)
+    return AccelerationLimits(
+        np.maximum(smallest["ddq"], 0.0), np.maximum(smallest["jerk"], 0.0)
+    )
 
 
 def _is_dense(trajectory: Trajectory) -> bool:

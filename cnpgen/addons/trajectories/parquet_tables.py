@@ -14,6 +14,7 @@ from cnpgen.addons.trajectories.trajectory_table import TrajectoryTable, Values
 from cnpgen.errors import UsageError, requires_extra
 from cnpgen.plans.format import JOINT_NAMES_KEY, PLAN_COLUMN
 from cnpgen.plans.stated_units import UNIT_ATTRIBUTES
+from cnpgen.schema.tables import JsonObject
 from cnpgen.store.files.atomic import read_file
 from cnpgen.store.files.size_limits import MAX_TABLE_BYTES, MAX_TEXT_ARRAY_BYTES
 
@@ -51,7 +52,7 @@ def read_parquet_tables(path: Path, _: LoadOptions) -> Iterator[TrajectoryTable]
     yield TrajectoryTable(str(path), columns)
 
 
-def _parquet_metadata(table: Any, key: bytes, path: Path) -> dict[str, Any]:
+def _parquet_metadata(table: Any, key: bytes, path: Path) -> JsonObject:
     """Return an object in the metadata of a table; empty without it."""
     try:
         found = json.loads((table.schema.metadata or {}).get(key, b"{}"))

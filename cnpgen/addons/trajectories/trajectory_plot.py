@@ -14,6 +14,7 @@ from cnpgen.problems.problem import Problem
 from cnpgen.robots.robot import Robot
 from cnpgen.robots.scene import Scene
 from cnpgen.robots.solid import place_obstacles
+from cnpgen.schema.tables import AnyPath
 from cnpgen.world.path import PathWorld
 
 
@@ -21,7 +22,7 @@ def plot_trajectory(
     problem: Problem,
     robot: Robot,
     trajectory: Trajectory,
-    path: str | Path,
+    path: AnyPath,
     *,
     title: str,
     margins: Sequence[Margin] = (),

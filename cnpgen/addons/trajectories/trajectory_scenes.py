@@ -50,6 +50,7 @@ from cnpgen.robots.scene import PARKED_POSITION_M
 from cnpgen.robots.urdf import urdf_tree
 from cnpgen.schema.arguments import concerning
 from cnpgen.schema.catalogue import find_recipe
+from cnpgen.schema.tables import AnyPath
 from cnpgen.schema.toml import Kind, read_table
 from cnpgen.store.files.accounted import check_allowed
 from cnpgen.store.files.kind import PLANS
@@ -117,7 +118,7 @@ def with_scenes(
 
 
 def plans_in_scenes(
-    plans: Plans, scenes: str | Path, allow_unused: Sequence[str] = ()
+    plans: Plans, scenes: AnyPath, allow_unused: Sequence[str] = ()
 ) -> Plans:
     """Place the obstacles of scenes around plans that have none: one scene for each, or one for all.
 

@@ -28,6 +28,7 @@ from cnpgen.errors import RecipeError
 from cnpgen.judges.plans.verdict import Margin
 from cnpgen.problems.constraints.constraint import Condition, Constraint
 from cnpgen.schema.keys import PerJoint, Range, field
+from cnpgen.schema.tables import Names
 
 if TYPE_CHECKING:
     from cnpgen.kernels.symbolic.symbolic_state import SymbolicState
@@ -153,7 +154,7 @@ class VelocityByPosition(Constraint):
         trajectory: Trajectory,
         errors: SampleErrors,
         largest: Array,
-        joints: tuple[str, ...],
+        joints: Names,
     ) -> RefutedLimit | None:
         """Return the limit that no curve through samples within their errors meets, or None.
 

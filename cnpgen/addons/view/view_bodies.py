@@ -20,6 +20,7 @@ from cnpgen.robots.shape.hull import outward_triangles
 from cnpgen.robots.shape.inline import read_mesh, scale_of, sides_of
 from cnpgen.robots.shape.mesh_files import find_named_file
 from cnpgen.robots.urdf import urdf_tree
+from cnpgen.schema.tables import JsonObject
 
 # Radius of an arm without link geometry, if no constraint gives one.
 
@@ -80,7 +81,7 @@ def capsule_bodies(robot: Robot) -> list[Body]:
     ]
 
 
-def planned_joints(robot: Robot) -> tuple[list[dict[str, Any]], list[float]]:
+def planned_joints(robot: Robot) -> tuple[list[JsonObject], list[float]]:
     """Return the planned joints and the placement of the tip, by columns, from which the page computes poses."""
     import pinocchio as pin
 

@@ -63,7 +63,7 @@ def save_film(
     options = (
         {"duration": 1000 / FILM_FRAMES_PER_S, "loop": 0}
         if path.suffix == ".gif"
-        else {"fps": FILM_FRAMES_PER_S, "macro_block_size": 1}
+        else {"format": "FFMPEG", "fps": FILM_FRAMES_PER_S, "macro_block_size": 1}
     )
     try:
         imageio.mimsave(path, images, **options)
