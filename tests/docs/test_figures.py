@@ -17,7 +17,11 @@ NOT_QUOTED = {
     "process_memory",
     "refiner_problems",
 }
-NOT_QUOTED |= {"ipopt", "numpy_transcription", "slsqp"}  # parts of benchmarks/refiner.py
+NOT_QUOTED |= {
+    "ipopt",
+    "numpy_transcription",
+    "slsqp",
+}  # parts of benchmarks/refiner.py
 # Parts of benchmarks/chunks.py, drives.py and episodes.py.
 NOT_QUOTED |= {"chunk_baselines", "chunk_loop", "drive_plant", "episode_programs"}
 
