@@ -49,6 +49,7 @@ from cnpgen.addons.trajectories.trajectory_verdict import (
 )
 from cnpgen.addons.trajectories.velocity_by_position import VelocityByPosition
 from cnpgen.addons.trajectories.witness import witness
+from cnpgen.arrays import Array
 from cnpgen.judges.plans.bernstein import find_maximum
 from cnpgen.judges.plans.joint_limits import ProvenJointLimits, quantity_of
 from cnpgen.judges.plans.judge import MAX_STEP_S
@@ -94,12 +95,16 @@ def refute(
 
 
 def judge_samples(
-    judge: FamilyJudge, trajectory: Trajectory, errors: SampleErrors
+    judge: FamilyJudge,
+    trajectory: Trajectory,
+    errors: SampleErrors,
+    *,
+    scene: Array | None = None,
 ) -> TrajectoryVerdict:
     """Judge the motion that samples resolve.
 
     Jitter must be part of the errors of the values (``with_jitter``) but for the curves
-    that meet samples within it.
+    that meet samples within it. The scene is that of ``FamilyJudge``.
     """
     limits = judge.limits(trajectory.parameters)
     ends = acceleration_limits(limits)
@@ -110,7 +115,7 @@ def judge_samples(
     for curve, step in tries:
         excess = _joint_limit_excess(curve, limits)
         if excess is None:
-            verdict = judge(curve, trajectory, step=step)
+            verdict = judge(curve, trajectory, scene=scene, step=step)
             if verdict.valid:
                 return verdict
             excess = ""
@@ -128,10 +133,10 @@ def judge_samples(
     if exact and is_dense and trajectory.dq is None:
         line = interpolated(trajectory, "linear", noise)
         smooth = through_positions(trajectory, SMOOTH_NEIGHBORS)
-        found = judge(line, trajectory, smooth=smooth)
+        found = judge(line, trajectory, scene=scene, smooth=smooth)
         return _assuming(LINES, found, detail)
     family = resolved_curves(trajectory, noise, ends.acceleration)
-    return _assuming(RESOLUTION, judge(family, trajectory), detail)
+    return _assuming(RESOLUTION, judge(family, trajectory, scene=scene), detail)
 
 
 def _assuming(

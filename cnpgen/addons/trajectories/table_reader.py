@@ -29,11 +29,10 @@ from cnpgen.addons.trajectories.trajectory_table import (
     MAX_RATE_DEVIATION,
     TrajectoryTable,
 )
-from cnpgen.arrays import Array
+from cnpgen.arrays import Array, NamedNumbers
 from cnpgen.errors import UsageError, listed, nearest
 from cnpgen.plans.format import PHASE_COLUMN
 from cnpgen.problems.problem_record import ProblemRecord
-from cnpgen.schema.tables import NamedNumbers
 from cnpgen.store.scene_table import OBSTACLE_POSES
 
 UNUSED_KINDS = ("jerk", "effort", "efforts")  # not reported as ignored

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from cnpgen.arrays import AnyArray, Array
+from cnpgen.arrays import AnyArray, Array, Mask
 from cnpgen.kernels.compiled_kernel import CACHE_LINE_DOUBLES, address_of, aligned_array
 from cnpgen.kernels.library import KernelLibrary
 from cnpgen.refine.solver.bounds import Bounds
@@ -23,7 +23,6 @@ from cnpgen.refine.solver.qp_subproblem import (
     MIN_MULTIPLIER,
     QP_TOLERANCE,
     THINNING,
-    Mask,
     ResidualSelection,
     Step,
 )
