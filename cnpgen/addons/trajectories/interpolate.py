@@ -113,7 +113,7 @@ def bounded_jerk(
     # most the integral of the absolute kernel times J h^3. Its own jerk is anywhere
     # within the bound: the nominal value is 0.
     bounds = [
-        polynomials.kernel_norms(order)[:, None] * h ** (3 - order) * max_jerk
+        polynomials.kernel_norms(order)[:, None] * h**3 * max_jerk / h**order
         + polynomials.noise_errors(order)
         for order in range(3)
     ]
