@@ -14,6 +14,7 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from cnpgen.arrays import JsonObject
 from cnpgen.cli import recipe_names, values
 from cnpgen.cli.interruption import resumable
 from cnpgen.cli.parser import (
@@ -28,7 +29,6 @@ from cnpgen.cli.parser import (
 from cnpgen.cli.terminal import Meter
 from cnpgen.cli.verdict_text import checksum_text
 from cnpgen.errors import UsageError, counted
-from cnpgen.schema.tables import JsonObject
 
 if TYPE_CHECKING:
     from collections.abc import Callable

@@ -9,9 +9,9 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from cnpgen.arrays import JsonMapping, JsonObject, TextRows
 from cnpgen.cli.terminal import table
 from cnpgen.errors import counted
-from cnpgen.schema.tables import JsonMapping, JsonObject, TextRows
 
 if TYPE_CHECKING:
     from cnpgen.judges.plans import Verdict

@@ -11,6 +11,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+from cnpgen.arrays import JsonMapping, JsonObject
 from cnpgen.errors import PluginError, RecipeError, UsageError
 from cnpgen.pipelines.pipeline import Pipeline, listed_tasks, read_pipeline
 from cnpgen.pipelines.stages.stage import Stage
@@ -29,7 +30,6 @@ from cnpgen.schema.arguments import concerning
 from cnpgen.schema.catalogue import load_recipe, read_kind, reference
 from cnpgen.schema.keys import NAME, RecipeLocation, field
 from cnpgen.schema.parsing import Reader, parse, stored_values
-from cnpgen.schema.tables import JsonMapping, JsonObject
 from cnpgen.schema.texts import read_own, utf8_text
 from cnpgen.schema.toml import is_kind, read_table
 from cnpgen.store.dataset_spec import GENERATOR_REVISION, DatasetSpec

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
+from cnpgen.arrays import JsonObject
 from cnpgen.errors import UsageError
 from cnpgen.kernels.library import choose_backend
 from cnpgen.machine.versions import versions
@@ -15,7 +16,6 @@ from cnpgen.pipelines.prepared import PreparedPipeline
 from cnpgen.problems.problem import resolved
 from cnpgen.robots.scene import scene_capacity
 from cnpgen.schema.arguments import check_memory, integer
-from cnpgen.schema.tables import JsonObject
 from cnpgen.store.dataset_spec import DatasetSpec, default_shard_size
 from cnpgen.store.workspace import Workspace
 

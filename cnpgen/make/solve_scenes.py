@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from cnpgen.arrays import Array, Mask
+from cnpgen.arrays import Array, JsonObject, Mask
 from cnpgen.errors import UsageError, counted
 from cnpgen.machine.engine import Engine
 from cnpgen.machine.times import NO_TIME, Times
@@ -59,7 +59,6 @@ from cnpgen.robots.scene import Scene
 from cnpgen.robots.solid import place_obstacles
 from cnpgen.schema.argument_types import check_fields, checked_arguments
 from cnpgen.schema.old_keywords import with_old_keywords
-from cnpgen.schema.tables import JsonObject
 from cnpgen.store.dataset_spec import StoredProblem
 from cnpgen.world.pose_ik import PoseKinematics
 

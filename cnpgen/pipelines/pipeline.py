@@ -5,6 +5,7 @@ from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 
+from cnpgen.arrays import JsonMapping, NamedErrors
 from cnpgen.errors import PluginError, RecipeError, UsageError
 from cnpgen.pipelines.stages.draw_scenes import DrawScenes
 from cnpgen.pipelines.stages.stage import Context, Stage, StageFunction
@@ -16,7 +17,6 @@ from cnpgen.schema.argument_types import checked_arguments
 from cnpgen.schema.catalogue import load_recipe, read_kind, reference
 from cnpgen.schema.keys import NAME, RecipeLocation, field
 from cnpgen.schema.parsing import Reader, parse, stored_values
-from cnpgen.schema.tables import JsonMapping, NamedErrors
 from cnpgen.schema.toml import read_table
 from cnpgen.store.field import Field, Fields
 from cnpgen.store.scene_table import SCENE_ID

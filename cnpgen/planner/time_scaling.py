@@ -174,10 +174,8 @@ def make_time_scaling(
     problem: Problem, robot: Robot, kernels: KernelLibrary
 ) -> TimeScaling:
     """Load the time scaling of one problem."""
-    speeds, residuals = (
-        make_phase_grid(problem, kernels, SCALING_INTERVALS),
-        kernels.load(speed_residuals),
-    )
+    speeds = make_phase_grid(problem, kernels, SCALING_INTERVALS)
+    residuals = kernels.load(speed_residuals)
     return TimeScaling(
         speeds.violation,
         speeds.path,

@@ -11,7 +11,7 @@ from typing import Any, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from cnpgen.arrays import Mask
+from cnpgen.arrays import JsonObject, Mask
 from cnpgen.errors import UsageError, counted
 from cnpgen.judges.plans import Reason, Verdict, judge, summarize_verdicts
 from cnpgen.judges.plans.judge import check_step
@@ -25,7 +25,6 @@ from cnpgen.problems.problem_record import open_problem
 from cnpgen.schema.argument_types import checked_arguments
 from cnpgen.schema.arguments import number, numbers
 from cnpgen.schema.html_table import html_table
-from cnpgen.schema.tables import JsonObject
 
 T = TypeVar("T")
 

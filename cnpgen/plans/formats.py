@@ -12,11 +12,10 @@ from typing import Any
 
 import numpy as np
 
-from cnpgen.arrays import AnyArray, Array, Integers
+from cnpgen.arrays import AnyArray, Array, Integers, JsonObject
 from cnpgen.errors import UsageError, requires_extra
 from cnpgen.plans.exporter import ExportedSet, Exporter, SampledPlan, parameter_columns
 from cnpgen.plans.format import JOINT_NAMES_KEY, PHASE_COLUMN, PLAN_COLUMN
-from cnpgen.schema.tables import JsonObject
 from cnpgen.store.files.atomic import committing, write_file
 from cnpgen.store.files.hdf5 import create_hdf5
 from cnpgen.store.joint_units import unit_of, units_of_joints

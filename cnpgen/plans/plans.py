@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from cnpgen.arrays import AnyArray, Array, Integers
+from cnpgen.arrays import AnyArray, Array, Integers, NamedErrors
 from cnpgen.errors import UsageError, counted
 from cnpgen.plans.format import FLOATS, INTEGERS, NOTES, PlanStatus
 from cnpgen.plans.plausible import check_boundary_units
@@ -24,7 +24,6 @@ from cnpgen.robots.scene import Scene
 from cnpgen.schema.argument_types import check_fields, checked_arguments
 from cnpgen.schema.arguments import check_memory, integer, numbers, reject_masked
 from cnpgen.schema.html_table import html_table
-from cnpgen.schema.tables import NamedErrors
 from cnpgen.store.dataset_spec import StoredProblem
 from cnpgen.store.scene_table import OBSTACLE_POSES
 from cnpgen.trajectory.boundary import Boundary

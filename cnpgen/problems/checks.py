@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree
 
+from cnpgen.arrays import JsonObject
 from cnpgen.errors import PluginError, RecipeError, listed, nearest
 from cnpgen.problems.constraints.constraint import Constraint
 from cnpgen.problems.constraints.link_clearance import ObjectClearance
@@ -23,7 +24,6 @@ from cnpgen.robots.shape.mesh_files import find_named_file, find_urdf
 from cnpgen.robots.urdf import number_in, read_urdf, urdf_tree
 from cnpgen.schema.keys import RecipeLocation
 from cnpgen.schema.registry import BUILT_IN, CONSTRAINTS
-from cnpgen.schema.tables import JsonObject
 from cnpgen.schema.units import show
 from cnpgen.store.joint_units import units_of_joints
 

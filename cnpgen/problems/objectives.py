@@ -10,12 +10,12 @@ from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, ClassVar
 
+from cnpgen.arrays import NamedErrors
 from cnpgen.errors import RecipeError, UsageError, nearest
 from cnpgen.schema import registry
 from cnpgen.schema.arguments import concerning
 from cnpgen.schema.keys import RecipeLocation, field
 from cnpgen.schema.parsing import parse
-from cnpgen.schema.tables import NamedErrors
 
 if TYPE_CHECKING:
     from cnpgen.kernels.symbolic.linalg import Vec

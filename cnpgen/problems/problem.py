@@ -12,7 +12,7 @@ from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 
-from cnpgen.arrays import Array, Vector3
+from cnpgen.arrays import Array, JsonMapping, JsonObject, NamedErrors, Vector3
 from cnpgen.errors import MachineError, UsageError
 from cnpgen.problems.constraints.axis import TipAxis
 from cnpgen.problems.constraints.clearance import ObjectContact, RobotClearance
@@ -50,7 +50,6 @@ from cnpgen.robots.urdf_elements import check_elements
 from cnpgen.schema import registry
 from cnpgen.schema.argument_types import checked_arguments
 from cnpgen.schema.keys import NAME, Range, field, to_dict
-from cnpgen.schema.tables import JsonMapping, JsonObject, NamedErrors
 from cnpgen.store.files.cache_folder import (
     default_cache_folder,
     make_private_folder,

@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from cnpgen.arrays import JsonObject
 from cnpgen.errors import PluginError, RecipeError
 from cnpgen.problems.checks import ProblemTables, limit_errors, problem_errors, tables
 from cnpgen.problems.constraints.constraint import Constraint
@@ -26,7 +27,6 @@ from cnpgen.schema.argument_types import checked_arguments
 from cnpgen.schema.catalogue import load_recipe, read_kind, reference
 from cnpgen.schema.keys import RecipeLocation
 from cnpgen.schema.parsing import Reader, parse, stored_values
-from cnpgen.schema.tables import JsonObject
 from cnpgen.schema.toml import Kind, read_table
 from cnpgen.schema.units import show
 

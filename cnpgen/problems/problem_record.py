@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 from numpy.typing import ArrayLike
 
-from cnpgen.arrays import Array
+from cnpgen.arrays import Array, JsonObject
 from cnpgen.errors import RecipeError, UsageError, counted
 from cnpgen.problems.objectives import read_objective
 from cnpgen.problems.problem import (
@@ -36,7 +36,6 @@ from cnpgen.schema.argument_types import checked_arguments
 from cnpgen.schema.arguments import concerning, numbers
 from cnpgen.schema.keys import RecipeLocation
 from cnpgen.schema.parsing import parse, stored_values
-from cnpgen.schema.tables import JsonObject
 from cnpgen.store.dataset_spec import StoredProblem
 from cnpgen.store.files.cache_folder import temporary_folder
 from cnpgen.store.files.document_structure import (

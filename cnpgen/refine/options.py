@@ -2,6 +2,7 @@
 
 from dataclasses import asdict, dataclass
 
+from cnpgen.arrays import JsonObject
 from cnpgen.errors import UsageError
 from cnpgen.problems.objectives import read_objective
 from cnpgen.refine.solver.sqp import DEFAULT_SETTINGS
@@ -13,7 +14,6 @@ from cnpgen.schema.arguments import (
     number,
     positive,
 )
-from cnpgen.schema.tables import JsonObject
 
 MAX_STAY_WITHIN = 1.0  # rad or m
 

@@ -8,12 +8,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from cnpgen.arrays import Array, Mask
+from cnpgen.arrays import Array, JsonObject, Mask
 from cnpgen.errors import counted
 from cnpgen.machine.times import NO_TIME, Times
 from cnpgen.plans.plans import Plans
 from cnpgen.refine.task import DISTANCE_PHASES, Attempt
-from cnpgen.schema.tables import JsonObject
 from cnpgen.trajectory.spline import basis
 
 REFINEMENT_FORMAT = "cnpgen-refinement"

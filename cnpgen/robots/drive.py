@@ -11,11 +11,10 @@ from functools import cached_property
 
 import numpy as np
 
-from cnpgen.arrays import Array
+from cnpgen.arrays import Array, NamedErrors
 from cnpgen.errors import counted
 from cnpgen.robots.parameter_ranges import optional_key
 from cnpgen.schema.keys import PerJoint, field
-from cnpgen.schema.tables import NamedErrors
 
 MIN_REVERSAL_SPEED = 0.01  # rad/s; the verdict resolves reversals of 1 ms
 

@@ -4,12 +4,11 @@ import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
-from cnpgen.arrays import Vector3
+from cnpgen.arrays import NamedErrors, Vector3
 from cnpgen.robots.parameter_ranges import optional_key
 from cnpgen.robots.shape.hull import MAX_COORDINATE_M, check_solid
 from cnpgen.robots.shape.inline import corners_of, is_inline
 from cnpgen.schema.keys import Range, field, keys
-from cnpgen.schema.tables import NamedErrors
 from cnpgen.schema.units import PLAUSIBLE_MAX, suggested_unit
 
 _KEYS = {  # kind -> keys of pose and size; those of _OPTIONAL may be omitted

@@ -8,10 +8,9 @@ from typing import Any
 
 import numpy as np
 
-from cnpgen.arrays import Vector3
+from cnpgen.arrays import NamedErrors, Vector3
 from cnpgen.robots.parameter_ranges import PAYLOAD_CENTRE, optional_key
 from cnpgen.schema.keys import PerJoint, Range, field
-from cnpgen.schema.tables import NamedErrors
 
 GEOMETRIES = ("urdf", "paper-capsules")
 SOURCE = r"^(vendor|urdf|stated|guess): \S.*"  # of a limit: its basis, then a text

@@ -5,7 +5,7 @@ import warnings
 from collections.abc import Mapping
 from typing import Any, TypeVar
 
-from cnpgen.schema.tables import NamedErrors
+from cnpgen.arrays import NamedErrors
 
 Options = TypeVar("Options")
 

@@ -5,7 +5,7 @@ import tomllib
 from pathlib import Path
 from typing import Literal
 
-from cnpgen.schema.tables import JsonObject
+from cnpgen.arrays import JsonObject
 from cnpgen.schema.texts import read_at_most, utf8_text
 
 Kind = Literal["problem", "pipeline", "dataset", "suite"]

@@ -7,8 +7,8 @@ from pathlib import Path
 
 import numpy as np
 
+from cnpgen.arrays import JsonObject
 from cnpgen.errors import DatasetError
-from cnpgen.schema.tables import JsonObject
 from cnpgen.store.checked_shard import Shard, read_rows
 from cnpgen.store.dataset_spec import (
     DatasetSpec,

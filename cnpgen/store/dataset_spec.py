@@ -13,8 +13,8 @@ from functools import cached_property
 from itertools import pairwise
 from pathlib import Path
 
+from cnpgen.arrays import JsonMapping, JsonObject
 from cnpgen.errors import DatasetError, UsageError, nearest
-from cnpgen.schema.tables import JsonMapping, JsonObject
 from cnpgen.store.field import Field, Fields
 from cnpgen.store.files.atomic import read_file
 from cnpgen.store.files.document_structure import (

@@ -6,8 +6,8 @@ from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 
+from cnpgen.arrays import JsonObject
 from cnpgen.errors import DatasetError
-from cnpgen.schema.tables import JsonObject
 from cnpgen.store.dataset_spec import DatasetSpec, ShardTask, shards
 from cnpgen.store.files.document_structure import ANY_KEY, TEXT
 from cnpgen.store.files.documents import load_document

@@ -8,8 +8,8 @@ from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 
+from cnpgen.arrays import JsonObject
 from cnpgen.errors import DatasetError
-from cnpgen.schema.tables import JsonObject
 from cnpgen.store.check import check_documents
 from cnpgen.store.dataset_spec import DatasetSpec, load_dataset_spec, shards
 from cnpgen.store.dataset_summary import DatasetSummary, summarize_dataset, unfinished

@@ -12,8 +12,8 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import cast
 
+from cnpgen.arrays import JsonObject
 from cnpgen.errors import DatasetError, UsageError
-from cnpgen.schema.tables import JsonObject
 from cnpgen.store.dataset_document import DatasetDocument
 from cnpgen.store.dataset_spec import DatasetSpec, shards
 from cnpgen.store.dataset_summary import (

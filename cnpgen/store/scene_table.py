@@ -13,9 +13,8 @@ from dataclasses import dataclass, fields
 
 import numpy as np
 
-from cnpgen.arrays import AnyArray, Indices, Integers
+from cnpgen.arrays import AnyArray, Indices, Integers, JsonObject
 from cnpgen.errors import DatasetError
-from cnpgen.schema.tables import JsonObject
 from cnpgen.store.field import Field
 
 SCENE_ID = "scene_id"

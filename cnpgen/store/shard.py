@@ -13,9 +13,8 @@ from typing import Any
 
 import numpy as np
 
-from cnpgen.arrays import AnyArray, Columns
+from cnpgen.arrays import AnyArray, Columns, JsonObject
 from cnpgen.errors import DatasetError, nearest
-from cnpgen.schema.tables import JsonObject
 from cnpgen.store.field import Field
 from cnpgen.store.files.atomic import committing
 from cnpgen.store.files.hdf5 import create_hdf5, open_hdf5

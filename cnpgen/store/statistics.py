@@ -8,9 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from cnpgen.arrays import AnyArray, Integers, Mask
+from cnpgen.arrays import AnyArray, Integers, JsonMapping, JsonObject, Mask
 from cnpgen.errors import DatasetError
-from cnpgen.schema.tables import JsonMapping, JsonObject
 from cnpgen.store.field import Field
 from cnpgen.store.files.document_structure import NUMBER, WHOLE, check_structure
 

@@ -8,9 +8,8 @@ from pathlib import Path
 
 import numpy as np
 
-from cnpgen.arrays import AnyArray, Mask
+from cnpgen.arrays import AnyArray, JsonMapping, JsonObject, Mask
 from cnpgen.errors import DatasetError, UsageError
-from cnpgen.schema.tables import JsonMapping, JsonObject
 from cnpgen.store.files.checksum_file import (
     Content,
     read_with_checksum,

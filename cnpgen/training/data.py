@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from cnpgen.arrays import Array
+from cnpgen.arrays import Array, JsonObject
 from cnpgen.errors import DatasetError, UsageError
 from cnpgen.loader.dataset import Dataset
 from cnpgen.loader.load import load_dataset
@@ -22,7 +22,6 @@ from cnpgen.problems.problem_record import as_problem
 from cnpgen.problems.scenes.scene_problem import SceneError, SceneProblem
 from cnpgen.problems.scenes.scene_reader import holds_scenes, read_scenes
 from cnpgen.schema.arguments import concerning
-from cnpgen.schema.tables import JsonObject
 from cnpgen.store.dataset_spec import StoredProblem
 from cnpgen.store.scene_table import OBSTACLE_POSES
 from cnpgen.training.training_rows import TrainingProblems

@@ -4,8 +4,8 @@ import json
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from cnpgen.arrays import JsonMapping, JsonObject
 from cnpgen.errors import UsageError
-from cnpgen.schema.tables import JsonMapping, JsonObject
 from cnpgen.store.files.atomic import committing, write_file
 from cnpgen.store.files.documents import parse_json
 from cnpgen.store.files.figure_file import new_figure

@@ -10,7 +10,7 @@ from functools import partial
 
 import numpy as np
 
-from cnpgen.arrays import AnyArray
+from cnpgen.arrays import AnyArray, JsonObject
 from cnpgen.errors import UsageError
 from cnpgen.losses.margins import Margins, suggested_margins
 from cnpgen.losses.metric import Metric, suggested_weights
@@ -34,7 +34,6 @@ from cnpgen.planner.network.features import (
 from cnpgen.planner.tasks import Tasks
 from cnpgen.plans.evaluate import evaluate_plans
 from cnpgen.schema.arguments import check_memory
-from cnpgen.schema.tables import JsonObject
 from cnpgen.store.files.documents import plain
 from cnpgen.store.scene_table import OBSTACLE_POSES
 from cnpgen.training.checkpoint import State, start_state

@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+from cnpgen.arrays import JsonMapping, JsonObject
 from cnpgen.errors import DatasetError, UsageError
 from cnpgen.machine.threads import one_thread
 from cnpgen.machine.times import NO_TIME, Stopwatch, Times
@@ -21,7 +22,6 @@ from cnpgen.problems.problem_record import (
 from cnpgen.schema.argument_types import checked_arguments
 from cnpgen.schema.arguments import concerning, integer
 from cnpgen.schema.old_keywords import with_old_keywords
-from cnpgen.schema.tables import JsonMapping, JsonObject
 from cnpgen.store.files.atomic import check_writable, file_sha256
 from cnpgen.store.files.documents import differences, plain
 from cnpgen.store.files.file_lock import output_lock

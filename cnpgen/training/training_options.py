@@ -6,8 +6,8 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
+from cnpgen.arrays import JsonMapping
 from cnpgen.schema.argument_types import check_fields
-from cnpgen.schema.tables import JsonMapping
 
 
 @dataclass(frozen=True)

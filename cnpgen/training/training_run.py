@@ -6,14 +6,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from cnpgen.arrays import AnyArray
+from cnpgen.arrays import AnyArray, JsonMapping, JsonObject
 from cnpgen.errors import MachineError
 from cnpgen.losses.metric import Metric
 from cnpgen.losses.plan_loss import PlanLoss
 from cnpgen.losses.quadrature import rotating_shift
 from cnpgen.machine.signals import signals_deferred
 from cnpgen.planner.model import Model
-from cnpgen.schema.tables import JsonMapping, JsonObject
 from cnpgen.training.adam import learning_rate
 from cnpgen.training.checkpoint import Best, Checkpoints, State, Sums
 from cnpgen.training.log import TrainingLog

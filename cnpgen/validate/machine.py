@@ -14,11 +14,11 @@ from collections.abc import Callable
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 
+from cnpgen.arrays import JsonObject
 from cnpgen.errors import PluginError, counted
 from cnpgen.machine.threads import users_environment
 from cnpgen.machine.versions import installed_version, processor_entry
 from cnpgen.schema.foreign_paths import foreign_path_hint
-from cnpgen.schema.tables import JsonObject
 
 REQUIRED_MODULES = (
     "numpy", "scipy", "casadi", "pinocchio", "coal", "h5py", "joblib", "psutil", "tqdm", "daqp", "threadpoolctl",

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
+from cnpgen.arrays import JsonObject
 from cnpgen.errors import DatasetError, MachineError, UsageError, counted
 from cnpgen.judges.rows.row_report import RowReport
 from cnpgen.kernels.library import Backend, choose_backend
@@ -15,7 +16,6 @@ from cnpgen.make.make_shards import Job, blocks_of, prepare, shard_columns
 from cnpgen.make.recipe import DatasetRecipe, recipe_digest, resolved_digest, restored
 from cnpgen.schema.argument_types import checked_arguments
 from cnpgen.schema.arguments import integer
-from cnpgen.schema.tables import JsonObject
 from cnpgen.store.check import REPLACE_HINT, Finding, check_dataset
 from cnpgen.store.dataset_spec import (
     GENERATOR_REVISION,

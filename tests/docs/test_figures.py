@@ -16,6 +16,7 @@ NOT_QUOTED = {
     "pinocchio_scipy",
     "process_memory",
     "refiner_problems",
+    "train_proposals",
 }
 NOT_QUOTED |= {
     "ipopt",

@@ -22,7 +22,7 @@ from cnpgen.addons.trajectories.interpolate import interpolated
 from cnpgen.addons.trajectories.judge_family import FamilyJudge
 from cnpgen.addons.trajectories.sampled_trajectory import Trajectory
 from cnpgen.addons.trajectories.trajectory_verdict import ConditionDecision, Decision
-from cnpgen.arrays import Array
+from cnpgen.arrays import Array, JsonObject
 from cnpgen.errors import UsageError
 from cnpgen.judges.plans.evaluated_trajectory import EvaluatedTrajectory
 from cnpgen.judges.plans.judge import reason_of
@@ -33,7 +33,6 @@ from cnpgen.judges.plans.verdict import Margin, PaperRule, Reason, Verdict
 from cnpgen.plans.evaluate import evaluate_plans
 from cnpgen.plans.plans import Plans
 from cnpgen.problems.problem_record import ProblemRecord, open_problem
-from cnpgen.schema.tables import JsonObject
 from cnpgen.world.path import PathWorld
 
 Task = tuple[Plans, JsonObject, ExecutedPrefix | None]

@@ -17,6 +17,7 @@ from dataclasses import asdict, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from cnpgen.arrays import JsonObject
 from cnpgen.cli import recipe_names, values
 from cnpgen.cli.interruption import resumable
 from cnpgen.cli.parser import (
@@ -30,7 +31,6 @@ from cnpgen.cli.parser import (
 )
 from cnpgen.cli.terminal import Meter, table
 from cnpgen.errors import CnpgenError, UsageError, counted
-from cnpgen.schema.tables import JsonObject
 
 if TYPE_CHECKING:
     from cnpgen.addons.benchmark.run_suite import Benchmark

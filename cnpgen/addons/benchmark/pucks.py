@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
-from cnpgen.arrays import Array
+from cnpgen.arrays import Array, NamedErrors
 from cnpgen.errors import RecipeError
 from cnpgen.make.complete import complete
 from cnpgen.pipelines.pipeline import Pipeline
@@ -28,7 +28,6 @@ from cnpgen.problems.problem import Problem
 from cnpgen.refine.refine_plans import solve_plans
 from cnpgen.schema.arguments import integer
 from cnpgen.schema.keys import Range, field
-from cnpgen.schema.tables import NamedErrors
 from cnpgen.trajectory.spline_motion import Motion
 
 State = tuple[Array, Array, Array]

@@ -16,9 +16,9 @@ from cnpgen.addons.benchmark.hypothesis_tests import (
     values_of,
 )
 from cnpgen.addons.benchmark.run_suite import Benchmark
+from cnpgen.arrays import JsonMapping, JsonObject, TextRows
 from cnpgen.errors import counted
 from cnpgen.schema.argument_types import checked_arguments
-from cnpgen.schema.tables import JsonMapping, JsonObject, TextRows
 from cnpgen.store.files.atomic import write_file
 
 FORMULA_STARTS = ("=", "+", "-", "@", "\t", "\r")  # of cells that spreadsheets execute

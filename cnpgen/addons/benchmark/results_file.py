@@ -16,12 +16,12 @@ from cnpgen.addons.benchmark.benchmark_planner import PLANNERS, Setting
 from cnpgen.addons.benchmark.hypothesis_tests import FIGURES
 from cnpgen.addons.benchmark.suite import Suite
 from cnpgen.addons.trajectories.sampled_trajectory import Trajectory
+from cnpgen.arrays import JsonObject
 from cnpgen.errors import DatasetError, UsageError
 from cnpgen.machine.versions import __version__, installed_version
 from cnpgen.plans.plans import Plans, make_plans
 from cnpgen.problems.problem import resolved
 from cnpgen.schema import addons
-from cnpgen.schema.tables import JsonObject
 from cnpgen.store.files.atomic import check_writable, machine_errors, write_file
 from cnpgen.store.files.document_structure import (
     ANY_KEY,

@@ -8,9 +8,9 @@ from dataclasses import asdict, dataclass
 from datetime import UTC, datetime
 from pathlib import Path
 
+from cnpgen.arrays import JsonObject
 from cnpgen.errors import DatasetError
 from cnpgen.machine.versions import installed_version, processor_entry, versions
-from cnpgen.schema.tables import JsonObject
 from cnpgen.store.files.atomic import read_file, write_file
 from cnpgen.store.files.document_structure import ANY_KEY, TEXT, WHOLE, check_structure
 from cnpgen.store.files.documents import parse_json

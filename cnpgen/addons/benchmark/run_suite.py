@@ -30,6 +30,7 @@ from cnpgen.addons.benchmark.simulator.execute import load_mujoco
 from cnpgen.addons.benchmark.simulator.executed import PLANE_TOLERANCE_M
 from cnpgen.addons.benchmark.simulator.plant import Plant, as_plant
 from cnpgen.addons.benchmark.suite import PlannerFields, Suite, load_suite
+from cnpgen.arrays import JsonMapping, JsonObject
 from cnpgen.errors import RecipeError, UsageError, counted
 from cnpgen.judges.plans.verdict import Verdict
 from cnpgen.machine.engine import Engine, WorkerPool, assembled
@@ -39,7 +40,6 @@ from cnpgen.schema import registry
 from cnpgen.schema.argument_types import checked_arguments
 from cnpgen.schema.arguments import concerning
 from cnpgen.schema.old_keywords import with_old_keywords
-from cnpgen.schema.tables import JsonMapping, JsonObject
 from cnpgen.store.files.documents import plain
 
 PROBLEMS_PER_TASK = 4  # of a worker; starting a planner takes some seconds

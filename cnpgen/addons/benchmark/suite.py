@@ -15,6 +15,7 @@ from cnpgen.addons.benchmark.pucks import (
     scenario_problems,
 )
 from cnpgen.addons.scene_files.scene_files import load_scenes
+from cnpgen.arrays import JsonObject, NamedErrors
 from cnpgen.errors import CnpgenError, nearest
 from cnpgen.make.draw_boundary_problems import draw_boundary_problems
 from cnpgen.make.recipe import load_dataset_recipe
@@ -29,7 +30,6 @@ from cnpgen.schema.arguments import integer
 from cnpgen.schema.catalogue import list_recipes, load_recipe, reference
 from cnpgen.schema.keys import NAME, RecipeLocation, field
 from cnpgen.schema.parsing import Reader, parse
-from cnpgen.schema.tables import JsonObject, NamedErrors
 from cnpgen.schema.toml import is_kind, read_table
 from cnpgen.schema.units import show
 

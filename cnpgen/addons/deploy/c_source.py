@@ -111,6 +111,14 @@ def _handwritten(name: str) -> str:
     return (SOURCES / name).read_text(encoding="utf-8")
 
 
+def filled(name: str, values: dict[str, str]) -> str:
+    """Return a file of ``SOURCES`` with values in the place of ``@PLACEHOLDER@``, in their order."""
+    text = _handwritten(name)
+    for placeholder, value in values.items():
+        text = text.replace(f"@{placeholder}@", value)
+    return text
+
+
 def _files(parts: PlannerParts) -> list[str]:
     files = ["grid.c", "splines.c"]
     files += ["time_parametrization.c"] if parts.parametrization is not None else []
@@ -207,11 +215,9 @@ def header_text(parts: PlannerParts, names: Names) -> str:
         "MEMORY": _memory(parts),
         "STOP": "" if parts.problem.uses_jerk else _handwritten("stop.h"),
     }
-    text = _handwritten("header.h")
-    for placeholder, value in fields.items():
-        text = text.replace(f"@{placeholder}@", value)
-    text = text.replace("@N@", str(n)).replace("@M@", str(size["CONSTRAINTS"]))
-    return names.apply(text)
+    # The declaration of stops has the placeholder of the number of joints.
+    fields |= {"N": str(n), "M": str(size["CONSTRAINTS"])}
+    return names.apply(filled("header.h", fields))
 
 
 def _introduction(parts: PlannerParts, names: Names) -> str:
@@ -273,21 +279,34 @@ def _request(parts: PlannerParts) -> str:
 
 def _memory(parts: PlannerParts) -> str:
     """Return the fields of the working memory."""
-    size, outputs = (
-        sizes(parts),
-        {name: sum(t.outputs) for name, t in parts.tapes.items()},
-    )
-    inputs = {name: sum(t.inputs) for name, t in parts.tapes.items()}
+    size, architecture = sizes(parts), parts.model.architecture
+    lines = [
+        f"  double {name}[{count}];" for name, count in _doubles(parts, size).items()
+    ]
+    if parts.parametrization is not None:
+        lines += [
+            f"  double direction[2][{size['PHASES']}];",
+            f"  double quadratic[{size['ROWS']}][3][{size['LANES']}];",
+        ]
+    if parts.scaling is not None:
+        lines.append(f"  double residuals[3][{size['RESIDUALS'] * LANES}];")
+    lines += [
+        f"  float x[{size['FEATURE_WIDTH']}], hidden[2][{padded(architecture.hidden)}];",
+        f"  float phi[{padded(architecture.path_outputs)}], log_rate[{padded(architecture.rate_outputs)}];",
+    ]
+    assert size["CELLS"] == len(cells(parts)) - 1
+    return "\n".join(lines) + "\n"
+
+
+def _doubles(parts: PlannerParts, size: dict[str, int]) -> dict[str, int]:
+    """Return the lengths of the arrays of the working memory by name."""
+    inputs = {name: sum(tape.inputs) for name, tape in parts.tapes.items()}
+    outputs = {name: sum(tape.outputs) for name, tape in parts.tapes.items()}
     phases, rows = size["PHASES"], size["CHECKED_PHASES"]
     # Both checks use the same memory, one after the other.
     most_rows = max(size["MOVING_ROWS"] * phases, size["POSITION_ROWS"] * rows, 1)
     # Functions of one point share the memory of their inputs.
-    points = [
-        inputs[name]
-        for name in ("task", "line_change", "projected_path")
-        if name in inputs
-    ]
-    architecture = parts.model.architecture
+    points = [inputs[name] for name in POINT_TAPES if name in inputs]
     fields = {
         "ends": size["ENDS"],
         "in": max(points),
@@ -303,17 +322,4 @@ def _memory(parts: PlannerParts) -> str:
         fields["coefficients"] = 3 * size["ROWS"] * phases
     if parts.scaling is not None:
         fields["moving"] = inputs["speed_residuals"] * LANES
-    lines = [f"  double {name}[{count}];" for name, count in fields.items()]
-    if parts.parametrization is not None:
-        lines += [
-            f"  double direction[2][{phases}];",
-            f"  double quadratic[{size['ROWS']}][3][{size['LANES']}];",
-        ]
-    if parts.scaling is not None:
-        lines.append(f"  double residuals[3][{size['RESIDUALS'] * LANES}];")
-    lines += [
-        f"  float x[{size['FEATURE_WIDTH']}], hidden[2][{padded(architecture.hidden)}];",
-        f"  float phi[{padded(architecture.path_outputs)}], log_rate[{padded(architecture.rate_outputs)}];",
-    ]
-    assert size["CELLS"] == len(cells(parts)) - 1
-    return "\n".join(lines) + "\n"
+    return fields

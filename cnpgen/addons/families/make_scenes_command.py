@@ -15,11 +15,11 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from cnpgen.arrays import JsonObject
 from cnpgen.cli import recipe_names, values
 from cnpgen.cli.parser import Parser, add_json, refuse_others
 from cnpgen.cli.terminal import Meter
 from cnpgen.errors import RecipeError, UsageError, counted
-from cnpgen.schema.tables import JsonObject
 
 if TYPE_CHECKING:
     from cnpgen.problems.scenes.scene_problem import SceneProblem

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 from numpy.random import Generator
 
-from cnpgen.arrays import Array
+from cnpgen.arrays import Array, JsonMapping
 from cnpgen.errors import RecipeError, UsageError, nearest
 from cnpgen.pipelines.resting_states import RestingStates, seeds_of
 from cnpgen.pipelines.scene_family import Grasp, Layout, SceneFamily
@@ -31,7 +31,6 @@ from cnpgen.schema.argument_types import checked_arguments
 from cnpgen.schema.arguments import integer
 from cnpgen.schema.keys import RecipeLocation
 from cnpgen.schema.parsing import parse
-from cnpgen.schema.tables import JsonMapping
 from cnpgen.store.dataset_spec import StoredProblem
 from cnpgen.world.pose_ik import PoseKinematics, solve_pose_ik
 from cnpgen.world.world import World

@@ -13,10 +13,10 @@ from cnpgen.addons.hub.card_problem import (
     what_samples_prove,
 )
 from cnpgen.addons.hub.markdown import markdown_table
+from cnpgen.arrays import JsonMapping, TextRows
 from cnpgen.problems.constraints.joint import judged_torque
 from cnpgen.problems.problem_record import as_record, open_problem
 from cnpgen.robots.drive import RIGID
-from cnpgen.schema.tables import JsonMapping, TextRows
 from cnpgen.store.dataset_spec import DatasetSpec
 from cnpgen.store.dataset_summary import DatasetSummary
 from cnpgen.store.field import Field

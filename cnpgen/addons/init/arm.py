@@ -12,6 +12,7 @@ from xml.etree.ElementTree import Element
 import numpy as np
 
 from cnpgen.addons.init.doubts import doubts
+from cnpgen.arrays import Names
 from cnpgen.errors import RecipeError, UsageError, listed
 from cnpgen.problems.checks import frames_of, missing_frame, unread_xacro
 from cnpgen.problems.urdf_dynamics import (
@@ -28,7 +29,6 @@ from cnpgen.robots.urdf_parameters import (
     UrdfParameters,
     urdf_parameters,
 )
-from cnpgen.schema.tables import Names
 
 # Ranges to either side, where the URDF has none.
 DEFAULT_RANGE_RAD = math.pi

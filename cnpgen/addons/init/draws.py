@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from cnpgen.arrays import Array, Mask
+from cnpgen.arrays import Array, Mask, Names
 from cnpgen.errors import RecipeError
 from cnpgen.kernels.library import choose_backend
 from cnpgen.pipelines.pipeline import Pipeline
@@ -17,7 +17,6 @@ from cnpgen.problems.problem import Problem
 from cnpgen.robots.robot import Robot
 from cnpgen.robots.shape.link_pairs import LinkContact, body_of_part, joint_poses
 from cnpgen.schema.keys import Range
-from cnpgen.schema.tables import Names
 from cnpgen.world.world import World
 
 BASE_CANDIDATES = 4000  # random states; the base configuration is one of them

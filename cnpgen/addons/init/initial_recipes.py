@@ -17,7 +17,7 @@ from cnpgen.addons.init.stated_sources import (
     TORQUE_STATES,
     stated_sources,
 )
-from cnpgen.arrays import Array
+from cnpgen.arrays import Array, Names
 from cnpgen.errors import RecipeError
 from cnpgen.make.recipe import DatasetRecipe
 from cnpgen.pipelines.pipeline import Pipeline
@@ -45,7 +45,6 @@ from cnpgen.robots.urdf import read_urdf, urdf_tree
 from cnpgen.robots.urdf_changes import SRDF_NAMES
 from cnpgen.robots.urdf_elements import unknown_names
 from cnpgen.schema.keys import PerJoint, Range
-from cnpgen.schema.tables import Names
 from cnpgen.store.files.accounted import check_allowed
 
 # Range of inverse kinematics guesses around the base configuration.

@@ -8,9 +8,9 @@ from pathlib import Path
 from typing import Any
 
 from cnpgen.addons.init.arm import Arm, ArmJoint
+from cnpgen.arrays import Names
 from cnpgen.errors import UsageError, nearest
 from cnpgen.problems.scenes.yaml_document import read_yaml
-from cnpgen.schema.tables import Names
 
 _LIMITS = {  # flag -> the keys that it switches on
     "has_position_limits": ("min_position", "max_position"),

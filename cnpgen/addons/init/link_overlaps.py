@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 from itertools import takewhile
 
 from cnpgen.addons.init.hull_gap import GAP_STATES, HullGap, PairGap, measure_hull_gap
+from cnpgen.arrays import Names
 from cnpgen.errors import listed
 from cnpgen.problems.load_robot import load_robot
 from cnpgen.problems.problem import Problem
@@ -13,7 +14,6 @@ from cnpgen.robots.shape.inline import mesh_links
 from cnpgen.robots.shape.link_pairs import LinkPair
 from cnpgen.robots.urdf import read_urdf
 from cnpgen.robots.urdf_changes import with_collision_geometry
-from cnpgen.schema.tables import Names
 
 # Fraction of the free states that convex parts may reject without further
 # decomposition.

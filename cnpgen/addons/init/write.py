@@ -14,6 +14,7 @@ from cnpgen.addons.init.link_overlaps import MAX_PAIR_GAP, LinkOverlaps
 from cnpgen.addons.init.stated_sources import INITIAL_JERK_RATE, PLACEHOLDERS
 from cnpgen.addons.manual.describe import link_rows, pair_rows, with_units
 from cnpgen.addons.manual.describe_keys import GROUPS, is_array, kind_summary, part_of
+from cnpgen.arrays import JsonMapping, JsonObject, Names, TextRows
 from cnpgen.cli.terminal import table
 from cnpgen.errors import counted
 from cnpgen.make.recipe import DatasetRecipe
@@ -21,7 +22,6 @@ from cnpgen.problems.load_robot import load_robot
 from cnpgen.robots.robot import Robot
 from cnpgen.schema import registry
 from cnpgen.schema.keys import Key, PerJoint, Range, keys
-from cnpgen.schema.tables import JsonMapping, JsonObject, Names, TextRows
 from cnpgen.store.joint_units import units_of_joints
 
 RECIPE_LINE_WIDTH = 118

@@ -5,6 +5,7 @@ from collections.abc import Sequence
 from textwrap import wrap
 from typing import Any
 
+from cnpgen.arrays import JsonObject, TextRows
 from cnpgen.cli.terminal import LINE_WIDTH, table
 from cnpgen.make.any_recipe import Recipe
 from cnpgen.make.recipe import DatasetRecipe, recipe_digest
@@ -28,7 +29,6 @@ from cnpgen.robots.urdf import urdf_tree
 from cnpgen.robots.urdf_parameters import urdf_parameters
 from cnpgen.schema import registry
 from cnpgen.schema.keys import PerJoint, Range, keys
-from cnpgen.schema.tables import JsonObject, TextRows
 from cnpgen.store.joint_units import unit_of
 
 LIMITS = {  # with their units at joints that turn

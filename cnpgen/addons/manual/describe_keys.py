@@ -5,6 +5,7 @@ from collections.abc import Sequence
 from typing import get_args
 
 from cnpgen.addons.manual.describe import quantity, title_lines
+from cnpgen.arrays import JsonObject
 from cnpgen.cli.terminal import table
 from cnpgen.make.recipe import DatasetRecipe
 from cnpgen.pipelines.pipeline import Pipeline
@@ -14,7 +15,6 @@ from cnpgen.problems.objectives import ObjectiveTerm
 from cnpgen.problems.problem import Problem
 from cnpgen.schema import addons, registry
 from cnpgen.schema.keys import Key, Range, keys
-from cnpgen.schema.tables import JsonObject
 from cnpgen.schema.toml import Kind
 
 _CORE_FILES: dict[str, type] = {

@@ -3,10 +3,10 @@
 import argparse
 from pathlib import Path
 
+from cnpgen.arrays import JsonObject
 from cnpgen.cli.parser import Parser, add_json
 from cnpgen.cli.terminal import table
 from cnpgen.errors import RecipeError, counted
-from cnpgen.schema.tables import JsonObject
 from cnpgen.schema.toml import Kind
 
 _HOW = {

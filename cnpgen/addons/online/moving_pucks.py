@@ -23,7 +23,7 @@ from cnpgen.addons.online.hit_tasks import (
     lanes,
     state_lanes,
 )
-from cnpgen.arrays import Array, Indices, Mask
+from cnpgen.arrays import Array, Indices, Mask, Names
 from cnpgen.errors import UsageError
 from cnpgen.pipelines.completion import Completion
 from cnpgen.pipelines.stages.stage import TaskBatch
@@ -36,7 +36,6 @@ from cnpgen.problems.constraints.puck_contact import (
 )
 from cnpgen.schema.argument_types import check_fields
 from cnpgen.schema.arguments import check_range, numbers
-from cnpgen.schema.tables import Names
 from cnpgen.trajectory.spline import basis
 
 HitArguments = tuple[

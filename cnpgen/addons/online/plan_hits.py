@@ -17,7 +17,7 @@ from cnpgen.addons.online.hit_tasks import (
     load_completion,
 )
 from cnpgen.addons.online.moving_pucks import MovingHits, PuckModel, plan_moving_hits
-from cnpgen.arrays import Array, Mask
+from cnpgen.arrays import Array, Mask, Names
 from cnpgen.errors import UsageError, counted
 from cnpgen.judges.plans.judge import Judge
 from cnpgen.machine.threads import one_thread
@@ -32,7 +32,6 @@ from cnpgen.problems.problem_record import as_problem, as_record, open_problem
 from cnpgen.schema.argument_types import check_fields, checked_arguments
 from cnpgen.schema.arguments import concerning, number, numbers
 from cnpgen.schema.old_keywords import CALLER, with_old_keywords
-from cnpgen.schema.tables import Names
 
 # From the centre of the paper's puck to that of its mallet at contact.
 

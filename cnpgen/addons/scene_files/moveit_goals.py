@@ -17,9 +17,8 @@ from cnpgen.addons.scene_files.moveit_frames import (
     rotation_of,
 )
 from cnpgen.addons.scene_files.moveit_shapes import read_regions
-from cnpgen.arrays import Array
+from cnpgen.arrays import Array, Names
 from cnpgen.problems.scenes.scene_problem import GoalPose, SceneError
-from cnpgen.schema.tables import Names
 
 _PARAMETRIZATIONS = {"0": EULER, "XYZ_EULER_ANGLES": EULER}
 _PARAMETRIZATIONS |= {"1": ROTATION_VECTOR, "ROTATION_VECTOR": ROTATION_VECTOR}

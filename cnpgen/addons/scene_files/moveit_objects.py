@@ -24,9 +24,9 @@ from cnpgen.addons.scene_files.moveit_shapes import (
     read_shapes,
     shape_poses,
 )
+from cnpgen.arrays import Names
 from cnpgen.problems.scenes.scene_problem import SceneError, check_count
 from cnpgen.problems.scenes.scene_request import AttachedObject
-from cnpgen.schema.tables import Names
 
 _LOG = logging.getLogger(__name__)
 OPERATIONS = ("ADD", "REMOVE", "APPEND", "MOVE")  # in the order of their codes

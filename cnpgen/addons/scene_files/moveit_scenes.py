@@ -48,6 +48,7 @@ from cnpgen.addons.scene_files.moveit_path import read_path_constraints
 from cnpgen.addons.scene_files.moveit_shapes import built
 from cnpgen.addons.scene_files.moveit_unused import UNUSED_ELEMENTS
 from cnpgen.addons.scene_files.octomap import read_octomap
+from cnpgen.arrays import JsonMapping, Names
 from cnpgen.errors import listed, nearest
 from cnpgen.problems.scenes.scene_problem import (
     MAX_SCENE_OBSTACLES,
@@ -57,7 +58,6 @@ from cnpgen.problems.scenes.scene_problem import (
 from cnpgen.problems.scenes.scene_reader import ReadingOptions
 from cnpgen.problems.scenes.scene_request import SceneRequest
 from cnpgen.robots.obstacle import Obstacle
-from cnpgen.schema.tables import JsonMapping, Names
 from cnpgen.store.files.accounted import (
     MISSPELT,
     Account,

@@ -20,6 +20,7 @@ from cnpgen.addons.scene_files.robometrics_scenes import (
     is_robometrics,
     read_robometrics,
 )
+from cnpgen.arrays import AnyPath, JsonObject
 from cnpgen.errors import UsageError, listed
 from cnpgen.problems.scenes.scene_problem import (
     MAX_SCENES,
@@ -32,7 +33,6 @@ from cnpgen.problems.scenes.scene_reader import ReadingOptions
 from cnpgen.problems.scenes.yaml_document import read_yaml
 from cnpgen.schema.argument_types import checked_arguments
 from cnpgen.schema.arguments import integer
-from cnpgen.schema.tables import AnyPath, JsonObject
 from cnpgen.store.files.accounted import Account, check_allowed
 from cnpgen.store.files.atomic import write_file
 from cnpgen.store.files.kind import HDF5_SUFFIXES, is_hdf5

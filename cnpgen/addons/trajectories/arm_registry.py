@@ -12,9 +12,8 @@ from importlib.resources import files
 
 import numpy as np
 
-from cnpgen.arrays import Array
+from cnpgen.arrays import Array, JsonMapping, JsonObject, Names
 from cnpgen.errors import UsageError, either, nearest
-from cnpgen.schema.tables import JsonMapping, JsonObject, Names
 
 BY_POSITION = "slope", "offset", "lower_end", "upper_end"  # of velocity limits
 VENDOR = "vendor"  # the basis of a limit that is a fact

@@ -10,11 +10,11 @@ import numpy as np
 from cnpgen.addons.trajectories.load_options import LoadOptions
 from cnpgen.addons.trajectories.table_units import plain
 from cnpgen.addons.trajectories.trajectory_table import TrajectoryTable, Values
+from cnpgen.arrays import Names
 from cnpgen.errors import UsageError
 from cnpgen.plans.format import PHASE_COLUMN
 from cnpgen.plans.stated_units import UNIT_ATTRIBUTES
 from cnpgen.robots.parameter_ranges import PARAMETER_UNITS
-from cnpgen.schema.tables import Names
 from cnpgen.store.files.archives import ArchiveError, read_arrays
 from cnpgen.store.files.hdf5 import open_hdf5
 

@@ -12,10 +12,10 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from cnpgen.arrays import Names
 from cnpgen.cli import values
 from cnpgen.cli.parser import Parser, refuse
 from cnpgen.errors import UsageError, counted, listed
-from cnpgen.schema.tables import Names
 
 if TYPE_CHECKING:
     from cnpgen.addons.trajectories.arm_registry import RecordedArm

@@ -11,8 +11,7 @@ import numpy as np
 
 from cnpgen.addons.trajectories.sample_errors import SampleErrors
 from cnpgen.addons.trajectories.sampled_trajectory import Trajectory
-from cnpgen.arrays import Array
-from cnpgen.schema.tables import Names
+from cnpgen.arrays import Array, Names
 
 CONTRADICTION = "velocities are not the derivative of the positions"
 EXPLAINED_SHARE = 0.3  # of the difference, that may remain after a correction

@@ -31,9 +31,8 @@ from cnpgen.addons.trajectories.lower_bounds import (
 )
 from cnpgen.addons.trajectories.sample_errors import rounding, time_rounding
 from cnpgen.addons.trajectories.velocity_by_position import span_limits
-from cnpgen.arrays import Array
+from cnpgen.arrays import Array, JsonObject
 from cnpgen.errors import counted
-from cnpgen.schema.tables import JsonObject
 
 NOMINAL_LAGS = (
     2  # distances in frames: a recorder that falls behind distorts longer ones

@@ -32,7 +32,7 @@ from cnpgen.addons.trajectories.trajectory_verdict import (
     Statement,
     TrajectoryVerdict,
 )
-from cnpgen.arrays import Array, Mask
+from cnpgen.arrays import Array, JsonObject, Mask
 from cnpgen.errors import UsageError, counted
 from cnpgen.judges.plans.judge import check_step
 from cnpgen.plans.evaluate import MAX_VERDICT_STEP_S, judged_in_parts
@@ -44,7 +44,6 @@ from cnpgen.robots.scene import Scene
 from cnpgen.robots.solid import pose_width
 from cnpgen.schema.argument_types import checked_arguments
 from cnpgen.schema.arguments import number, numbers
-from cnpgen.schema.tables import JsonObject
 from cnpgen.store.dataset_spec import StoredProblem
 
 FORMAT = "cnpgen-trajectory-evaluation"

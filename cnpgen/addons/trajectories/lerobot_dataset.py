@@ -20,10 +20,10 @@ from cnpgen.addons.trajectories.lerobot_tables import (
     LEROBOT_INFO,
     LEROBOT_STATE,
 )
+from cnpgen.arrays import JsonObject
 from cnpgen.errors import UsageError, requires_extra
 from cnpgen.plans.exporter import ExportedSet, Exporter, SampledPlan
 from cnpgen.plans.formats import fixed_lists, write_parquet
-from cnpgen.schema.tables import JsonObject
 from cnpgen.store.files.atomic import write_file
 
 Values = NDArray[Any]

@@ -15,9 +15,9 @@ from cnpgen.addons.trajectories.trajectory_table import (
     TrajectoryTable,
     Values,
 )
+from cnpgen.arrays import JsonMapping, JsonObject
 from cnpgen.errors import UsageError, nearest
 from cnpgen.robots.parameter_ranges import PARAMETER_UNITS
-from cnpgen.schema.tables import JsonMapping, JsonObject
 from cnpgen.store.files.accounted import MISSPELT
 from cnpgen.store.files.atomic import read_file
 from cnpgen.store.files.documents import parse_json

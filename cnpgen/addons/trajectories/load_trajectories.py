@@ -21,7 +21,7 @@ from cnpgen.addons.trajectories.table_units import plain
 from cnpgen.addons.trajectories.trajectory_scenes import problem_of_samples, with_scenes
 from cnpgen.addons.trajectories.trajectory_table import TrajectoryTable
 from cnpgen.addons.trajectories.trajectory_tables import read_trajectory_tables
-from cnpgen.arrays import Array
+from cnpgen.arrays import AnyPath, Array, Names
 from cnpgen.errors import UsageError, either, nearest
 from cnpgen.plans.stated_units import SCALE_ATTRIBUTES, UNIT_ATTRIBUTES
 from cnpgen.problems.problem import Problem
@@ -37,7 +37,6 @@ from cnpgen.robots.plausible_values import UnitError, find_implausible_value
 from cnpgen.robots.robot import Robot
 from cnpgen.schema.argument_types import checked_arguments
 from cnpgen.schema.old_keywords import with_old_keywords
-from cnpgen.schema.tables import AnyPath, Names
 from cnpgen.store.dataset_spec import StoredProblem
 from cnpgen.store.files.accounted import MISSPELT, check_allowed, unmatched
 

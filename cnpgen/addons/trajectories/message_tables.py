@@ -15,8 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cnpgen.addons.trajectories.trajectory_table import TrajectoryTable
+from cnpgen.arrays import JsonMapping
 from cnpgen.errors import UsageError
-from cnpgen.schema.tables import JsonMapping
 from cnpgen.store.files.accounted import (
     Account,
     UnusedElements,

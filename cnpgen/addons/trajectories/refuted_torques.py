@@ -19,9 +19,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from cnpgen.addons.trajectories.refuted_limits import RefutedLimit
-from cnpgen.arrays import Array, Indices
+from cnpgen.arrays import Array, Indices, Names
 from cnpgen.judges.plans.verdict import Margin
-from cnpgen.schema.tables import Names
 
 Torques = Callable[[Array, Array, Array], Array]  # of states, shape (K, n) each
 

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 
 from cnpgen.addons.trajectories.sampled_trajectory import Trajectory
-from cnpgen.arrays import Array
+from cnpgen.arrays import AnyPath, Array
 from cnpgen.judges.plans.plan_plot import PLOT_SAMPLES, draw_path, plot_times
 from cnpgen.judges.plans.verdict import Margin
 from cnpgen.problems.obstacles import scene_of
@@ -14,7 +14,6 @@ from cnpgen.problems.problem import Problem
 from cnpgen.robots.robot import Robot
 from cnpgen.robots.scene import Scene
 from cnpgen.robots.solid import place_obstacles
-from cnpgen.schema.tables import AnyPath
 from cnpgen.world.path import PathWorld
 
 

@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 
 from cnpgen.addons.trajectories.sampled_trajectory import Trajectory
-from cnpgen.arrays import Array
+from cnpgen.arrays import AnyPath, Array
 from cnpgen.errors import UsageError, counted, listed
 from cnpgen.make.recipe import load_dataset_recipe
 from cnpgen.plans.format import PlanStatus
@@ -50,7 +50,6 @@ from cnpgen.robots.scene import PARKED_POSITION_M
 from cnpgen.robots.urdf import urdf_tree
 from cnpgen.schema.arguments import concerning
 from cnpgen.schema.catalogue import find_recipe
-from cnpgen.schema.tables import AnyPath
 from cnpgen.schema.toml import Kind, read_table
 from cnpgen.store.files.accounted import check_allowed
 from cnpgen.store.files.kind import PLANS

@@ -8,7 +8,7 @@ from typing import Any
 
 from numpy.typing import NDArray
 
-from cnpgen.schema.tables import Names
+from cnpgen.arrays import Names
 
 Values = NDArray[Any]
 

@@ -12,8 +12,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from enum import StrEnum
 
+from cnpgen.arrays import JsonObject
 from cnpgen.judges.plans.verdict import Margin
-from cnpgen.schema.tables import JsonObject
 
 # An error this large, in SI units, is that of a missing derivative.
 DECIDING_ERROR = 1e3

@@ -23,12 +23,11 @@ from cnpgen.addons.trajectories.lower_bounds import LAGS, first_derivatives
 from cnpgen.addons.trajectories.refuted_limits import RefutedLimit
 from cnpgen.addons.trajectories.sample_errors import SampleErrors
 from cnpgen.addons.trajectories.sampled_trajectory import Trajectory
-from cnpgen.arrays import Array
+from cnpgen.arrays import Array, Names
 from cnpgen.errors import RecipeError
 from cnpgen.judges.plans.verdict import Margin
 from cnpgen.problems.constraints.constraint import Condition, Constraint
 from cnpgen.schema.keys import PerJoint, Range, field
-from cnpgen.schema.tables import Names
 
 if TYPE_CHECKING:
     from cnpgen.kernels.symbolic.symbolic_state import SymbolicState

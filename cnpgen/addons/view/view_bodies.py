@@ -10,7 +10,7 @@ from xml.etree import ElementTree
 import numpy as np
 from numpy.typing import NDArray
 
-from cnpgen.arrays import Array
+from cnpgen.arrays import Array, JsonObject
 from cnpgen.errors import RecipeError
 from cnpgen.problems.problem import Problem
 from cnpgen.robots.chain import frame_of
@@ -20,7 +20,6 @@ from cnpgen.robots.shape.hull import outward_triangles
 from cnpgen.robots.shape.inline import read_mesh, scale_of, sides_of
 from cnpgen.robots.shape.mesh_files import find_named_file
 from cnpgen.robots.urdf import urdf_tree
-from cnpgen.schema.tables import JsonObject
 
 # Radius of an arm without link geometry, if no constraint gives one.
 

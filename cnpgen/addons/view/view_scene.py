@@ -17,7 +17,7 @@ from cnpgen.addons.view.view_bodies import (
     tube,
     wrapped,
 )
-from cnpgen.arrays import Array
+from cnpgen.arrays import Array, JsonObject, Names
 from cnpgen.judges.plans.condition_curves import (
     ConditionCurve,
     condition_curves,
@@ -33,7 +33,6 @@ from cnpgen.problems.problem import Problem
 from cnpgen.robots.robot import Robot
 from cnpgen.robots.scene import PARKED_POSITION_M, Scene
 from cnpgen.robots.shape.hull import CUBE
-from cnpgen.schema.tables import JsonObject, Names
 from cnpgen.world.forward_kinematics import ForwardKinematics
 from cnpgen.world.path import PathWorld
 

@@ -8,8 +8,8 @@ from enum import StrEnum
 
 import numpy as np
 
+from cnpgen.arrays import JsonObject
 from cnpgen.schema.html_table import html_table
-from cnpgen.schema.tables import JsonObject
 
 # Replaces a tolerance of 0 in relative violations, so that they can be compared.
 ZERO_TOLERANCE = 1e-200

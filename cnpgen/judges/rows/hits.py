@@ -22,11 +22,10 @@ from itertools import combinations
 
 import numpy as np
 
-from cnpgen.arrays import Array
+from cnpgen.arrays import Array, JsonMapping
 from cnpgen.judges.rows.row_report import Check, Index, compare
 from cnpgen.problems.constraints.constraint import BOUNDARY_TOLERANCES
 from cnpgen.robots.robot import Robot
-from cnpgen.schema.tables import JsonMapping
 from cnpgen.world.measured_parameters import MeasuredParameters
 
 # Tolerance of the projected gradient of f [m^2/rad]. In float32 the joints have errors

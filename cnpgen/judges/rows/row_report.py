@@ -9,9 +9,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from cnpgen.arrays import Array
+from cnpgen.arrays import Array, JsonObject
 from cnpgen.problems.constraints.constraint import End
-from cnpgen.schema.tables import JsonObject
 
 ENDS: tuple[End, End] = ("start", "goal")
 

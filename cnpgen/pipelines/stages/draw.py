@@ -6,13 +6,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from cnpgen.arrays import Array, Vector3
+from cnpgen.arrays import Array, NamedErrors, Vector3
 from cnpgen.errors import RecipeError
 from cnpgen.kernels.symbolic.kinematics import tip_position
 from cnpgen.pipelines.stages.candidate_table import in_world, in_world_box
 from cnpgen.pipelines.stages.stage import CandidateBatch, Context, Stage, StageFunction
 from cnpgen.schema.keys import Range, field
-from cnpgen.schema.tables import NamedErrors
 from cnpgen.store.field import Field, Fields
 
 MAX_TASKS = 100_000

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from cnpgen.arrays import NamedErrors
 from cnpgen.errors import RecipeError
 from cnpgen.kernels.symbolic.kinematics import (
     Kinematics,
@@ -37,7 +38,6 @@ from cnpgen.pipelines.stages.stage import (
 from cnpgen.robots.plausible_values import find_implausible_value
 from cnpgen.robots.robot import Robot
 from cnpgen.schema.keys import Range, field
-from cnpgen.schema.tables import NamedErrors
 from cnpgen.store.field import Fields
 
 # M and rad, before the last step (quadratic convergence, except with joints on their

@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from cnpgen.arrays import Array, Mask
+from cnpgen.arrays import Array, Mask, NamedErrors
 from cnpgen.errors import RecipeError
 from cnpgen.kernels.kernel import Kernel
 from cnpgen.kernels.symbolic.kinematics import forward_kinematics, tip_position
@@ -28,7 +28,6 @@ from cnpgen.pipelines.stages.stage import (
 from cnpgen.pipelines.stages.torque import torque_ratio
 from cnpgen.robots.robot import Robot
 from cnpgen.schema.keys import field
-from cnpgen.schema.tables import NamedErrors
 from cnpgen.store.field import Fields
 
 Indices = NDArray[np.int64]

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from cnpgen.arrays import Array, Mask
+from cnpgen.arrays import Array, Mask, NamedErrors
 from cnpgen.problems.constraints.constraint import (
     Condition,
     Conditions,
@@ -21,7 +21,6 @@ from cnpgen.problems.constraints.constraint import (
     End,
 )
 from cnpgen.schema.keys import field
-from cnpgen.schema.tables import NamedErrors
 
 if TYPE_CHECKING:
     from cnpgen.kernels.symbolic.symbolic_state import SymbolicState

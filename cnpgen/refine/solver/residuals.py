@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from cnpgen.arrays import Array
+from cnpgen.arrays import Array, JsonObject
 from cnpgen.kernels.symbolic.linalg import symbols
 from cnpgen.kernels.symbolic.symbolic_state import (
     FrozenState,
@@ -21,7 +21,6 @@ from cnpgen.schema import registry
 from cnpgen.schema.catalogue import read_kind
 from cnpgen.schema.keys import RecipeLocation
 from cnpgen.schema.parsing import stored_values
-from cnpgen.schema.tables import JsonObject
 
 DISTANCE_SCALE_M = 0.1  # size of a residual of 1
 # Tolerances; with fewer the merit function rejects steps for equalities that are met

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from cnpgen.arrays import Array, Vector3
+from cnpgen.arrays import Array, JsonObject, Vector3
 from cnpgen.errors import RecipeError, nearest
 from cnpgen.robots.chain import Chain, frame_of
 from cnpgen.robots.robot_spec import HeldObject
@@ -29,7 +29,6 @@ from cnpgen.robots.shape.link_pairs import (
 )
 from cnpgen.robots.urdf import urdf_tree
 from cnpgen.robots.urdf_changes import disabled_pairs
-from cnpgen.schema.tables import JsonObject
 from cnpgen.store.files.cache_entry import read_entry, write_entry
 
 if TYPE_CHECKING:

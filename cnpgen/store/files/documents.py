@@ -15,8 +15,8 @@ from typing import Any
 
 import numpy as np
 
+from cnpgen.arrays import JsonMapping, JsonObject
 from cnpgen.errors import DatasetError
-from cnpgen.schema.tables import JsonMapping, JsonObject
 from cnpgen.store.files.atomic import read_file, write_file
 from cnpgen.store.files.document_structure import Structure, check_structure
 from cnpgen.store.files.size_limits import MAX_DOCUMENT_BYTES, MAX_DOCUMENT_DEPTH

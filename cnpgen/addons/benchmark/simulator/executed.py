@@ -10,9 +10,8 @@ from cnpgen.addons.benchmark.simulator import hockey
 from cnpgen.addons.benchmark.simulator.reference import TICK_S, Reference
 from cnpgen.addons.benchmark.simulator.simulator_scene import SimulatorScene
 from cnpgen.addons.benchmark.simulator.tip import Tip
-from cnpgen.arrays import Array, Mask
+from cnpgen.arrays import Array, JsonMapping, JsonObject, Mask
 from cnpgen.judges.plans.metrics import tilt
-from cnpgen.schema.tables import JsonMapping, JsonObject
 
 # Of the mallet's height, as in the Air Hockey Challenge (2023).
 

@@ -20,7 +20,7 @@ from cnpgen.addons.benchmark.simulator.reference import (
 )
 from cnpgen.addons.benchmark.simulator.simulator_scene import SimulatorScene
 from cnpgen.addons.benchmark.simulator.tip import Tip
-from cnpgen.arrays import Array
+from cnpgen.arrays import Array, JsonObject
 from cnpgen.errors import UsageError, counted
 from cnpgen.machine.workers import distribute, worker_count
 from cnpgen.plans.plans import Plans
@@ -28,7 +28,6 @@ from cnpgen.plans.tips import correct_tips
 from cnpgen.problems.problem_record import open_problem, with_payload_of
 from cnpgen.robots.table_frame import table_frame, upright_axes
 from cnpgen.schema.argument_types import checked_arguments
-from cnpgen.schema.tables import JsonObject
 
 SIMULATION_FORMAT = "cnpgen-simulation"
 SIMULATION_VERSION = 1
