@@ -3,6 +3,7 @@
 from cnpgen.addons.deploy.c_source import CODES, Names, filled
 from cnpgen.addons.deploy.c_text import comment_text
 from cnpgen.addons.deploy.planner_parts import PlannerParts
+from cnpgen.errors import counted
 from cnpgen.machine.versions import __version__
 
 
@@ -19,7 +20,7 @@ def readme_text(parts: PlannerParts, names: Names) -> str:
     )
     values = {
         "NAME": name,
-        "N": str(parts.robot.n),
+        "SIZE": counted(parts.robot.n, "joint"),
         "VERSION": __version__,
         "MODEL": comment_text(names.model),
         "JOINTS": joints,

@@ -8,17 +8,25 @@ some spans). All other coefficients stay, so the curve keeps its derivatives.
 """
 
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from cnpgen.addons.trajectories.curve_family import CurveFamily
 from cnpgen.addons.trajectories.interpolate import data_of, family_of_data
 from cnpgen.addons.trajectories.sample_errors import SampleErrors
 from cnpgen.addons.trajectories.sampled_trajectory import Trajectory
-from cnpgen.addons.trajectories.witness import DEGREE, MIN_ERRORS, fitted, is_within
-from cnpgen.arrays import Array
+from cnpgen.addons.trajectories.witness import (
+    DEGREE,
+    MIN_ERRORS,
+    derivatives_of,
+    fitted,
+    is_within,
+)
+from cnpgen.arrays import Array, Indices
+
+if TYPE_CHECKING:
+    from scipy.interpolate import BSpline
 
 WINDOW_SPANS = 10  # on both sides of a violation
 REFINED_SPANS = 3  # on both sides of a violation, with further knots
@@ -32,37 +40,6 @@ PROGRAM_LIMIT_SHARE = 1 - 1e-4  # of the limit, in the program: it holds at poin
 ERROR_SHARE = 0.999  # of the errors, for the rounding of the program
 
 
-@dataclass(frozen=True, eq=False)
-class _Spline:
-    """Spline of one joint."""
-
-    knots: Array
-    coefficients: Array
-
-    def at(self, t: Array, order: int = 0) -> Array:
-        """Evaluate a derivative at times [s]."""
-        from scipy.interpolate import BSpline
-
-        spline = BSpline(self.knots, self.coefficients, DEGREE)
-        return np.asarray(spline(t, order))
-
-    def refined(self, times: Array) -> "_Spline":
-        """Return the same curve with further knots."""
-        from scipy.interpolate import BSpline
-
-        spline = BSpline(self.knots, self.coefficients, DEGREE)
-        for time in times[~np.isin(times, self.knots)]:
-            spline = spline.insert_knot(float(time))
-        return _Spline(spline.t, spline.c[: len(spline.t) - DEGREE - 1])
-
-    def points(self, low: float, high: float) -> Array:
-        """Return points between two times, several in every interval of knots."""
-        inside = np.unique(self.knots[(self.knots >= low) & (self.knots <= high)])
-        parts = np.arange(POINTS_PER_INTERVAL) / POINTS_PER_INTERVAL
-        points = inside[:-1, None] + np.diff(inside)[:, None] * parts
-        return np.append(points.ravel(), inside[-1])
-
-
 def limited_witness(
     trajectory: Trajectory, errors: SampleErrors, limit: Array
 ) -> CurveFamily | None:
@@ -71,6 +48,8 @@ def limited_witness(
     None without a spline within the errors, with a jitter of the times, or if the
     program finds none.
     """
+    from scipy.interpolate import BSpline
+
     smooth = None if errors.t else fitted(trajectory, errors, 0.0)
     if smooth is None or not np.isfinite(limit).all():
         return None
@@ -78,41 +57,49 @@ def limited_witness(
     splines = []
     for joint, bound in enumerate(limit.tolist()):
         data = [values[:, joint] for values in data_of(trajectory)]
-        spline = _Spline(smooth.knots, smooth.coefficients[:, joint])
+        spline = BSpline(smooth.t, smooth.c[:, joint], DEGREE)
         limited = _limited(spline, trajectory.t, data, allowed, bound)
         if limited is None:
             return None
         splines.append(limited)
+
+    def at(t: Array) -> list[Array]:
+        orders = zip(*(derivatives_of(spline, t) for spline in splines), strict=True)
+        return [np.stack(columns, axis=1) for columns in orders]
+
     # The programs meet errors up to their tolerance, so all samples are compared again.
-    if not is_within(_JointSplines(splines), trajectory, errors):
+    if not is_within(at, trajectory, errors):
         return None
     # Between knots of any joint, every spline is one quintic. Its q, dq and ddq at both
     # ends determine it exactly.
-    times = np.unique(np.concatenate([spline.knots for spline in splines]))
-    return family_of_data(times, _JointSplines(splines).at(times))
+    times = np.unique(np.concatenate([spline.t for spline in splines]))
+    return family_of_data(times, at(times))
 
 
-@dataclass(frozen=True, eq=False)
-class _JointSplines:
-    """Splines of n joints with different knots."""
+def _refined(spline: "BSpline", times: Array) -> "BSpline":
+    """Return the same curve with further knots."""
+    from scipy.interpolate import BSpline
 
-    splines: list[_Spline]
+    for time in times[~np.isin(times, spline.t)]:
+        spline = spline.insert_knot(float(time))
+    return BSpline(spline.t, spline.c[: len(spline.t) - DEGREE - 1], DEGREE)
 
-    def at(self, t: Array) -> list[Array]:
-        """Return positions, velocities and accelerations, shape (K, n) each."""
-        return [
-            np.stack([spline.at(t, order) for spline in self.splines], axis=1)
-            for order in range(3)
-        ]
+
+def _points(spline: "BSpline", low: float, high: float) -> Array:
+    """Return points between two times, several in every interval of knots."""
+    inside = np.unique(spline.t[(spline.t >= low) & (spline.t <= high)])
+    parts = np.arange(POINTS_PER_INTERVAL) / POINTS_PER_INTERVAL
+    points = inside[:-1, None] + np.diff(inside)[:, None] * parts
+    return np.append(points.ravel(), inside[-1])
 
 
 def _limited(
-    spline: _Spline, t: Array, data: list[Array], allowed: Array, limit: float
-) -> _Spline | None:
+    spline: "BSpline", t: Array, data: list[Array], allowed: Array, limit: float
+) -> "BSpline | None":
     """Return the spline of one joint within the limit, or None."""
     for _ in range(MAX_WINDOWS):
-        points = spline.points(t[0], t[-1])
-        excess = np.abs(spline.at(points, 2)) - limit
+        points = _points(spline, t[0], t[-1])
+        excess = np.abs(spline(points, 2)) - limit
         # Each pass removes the worst excess; the window may leave others for the next
         # pass.
         if excess.max() <= 0:
@@ -123,7 +110,7 @@ def _limited(
             # More knots and a longer part of the motion, if there is no solution.
             near = _around(t, sample, size * REFINED_SPANS)
             steps = np.diff(near)[:, None] * np.arange(1, PARTS * size) / (PARTS * size)
-            spline = spline.refined((near[:-1, None] + steps).ravel())
+            spline = _refined(spline, (near[:-1, None] + steps).ravel())
             window = _around(t, sample, size * WINDOW_SPANS)
             chosen = np.isin(t, window)
             part = _Part(spline, window, [values[chosen] for values in data])
@@ -145,7 +132,7 @@ def _around(t: Array, sample: int, count: int) -> Array:
 class _Part:
     """Part of the spline of one joint between two samples, with the data at the samples in between."""
 
-    spline: _Spline
+    spline: "BSpline"
     t: Array
     data: list[Array]
 
@@ -155,10 +142,10 @@ class _Part:
         return float(np.diff(self.t).mean())
 
     @property
-    def free(self) -> NDArray[np.intp]:
+    def free(self) -> Indices:
         """Indices of the coefficients whose supports are between both ends."""
-        knots = self.spline.knots
-        index = np.arange(len(self.spline.coefficients))
+        knots = self.spline.t
+        index = np.arange(len(self.spline.c))
         inside = (knots[index] >= self.t[0]) & (knots[index + DEGREE + 1] <= self.t[-1])
         return np.asarray(index[inside], np.intp)
 
@@ -166,13 +153,14 @@ class _Part:
         """Return derivatives of the free basis functions, with a span as unit of time."""
         from scipy.interpolate import BSpline
 
-        size = len(self.spline.coefficients)
-        basis = BSpline(self.spline.knots, np.eye(size)[:, self.free], DEGREE)
+        size = len(self.spline.c)
+        basis = BSpline(self.spline.t, np.eye(size)[:, self.free], DEGREE)
         return np.asarray(basis(times, order) * self.span**order)
 
-    def smoothest(self, allowed: Array, limit: float) -> _Spline | None:
+    def smoothest(self, allowed: Array, limit: float) -> "BSpline | None":
         """Return the spline with the smallest jerks that meets the errors and the limit, or None."""
         import daqp
+        from scipy.interpolate import BSpline
 
         # The error of positions is the unit of the program, so its numbers are near
         # one.
@@ -195,16 +183,16 @@ class _Part:
         )
         if solution[2] != 1:
             return None
-        coefficients = self.spline.coefficients.copy()
+        coefficients = self.spline.c.copy()
         # The program states changes in units, not the coefficients themselves.
         coefficients[free] += unit * np.array(solution[0])
-        return _Spline(self.spline.knots, coefficients)
+        return BSpline(self.spline.t, coefficients, DEGREE)
 
     def _constraints(
         self, allowed: Array, limit: float, unit: float
     ) -> tuple[Array, Array, Array]:
         """Return rows and both bounds of the changes: errors at the samples, and the limit at the points."""
-        points = self.spline.points(self.t[0], self.t[-1])
+        points = _points(self.spline, self.t[0], self.t[-1])
         groups = [
             (self.t, order, values, ERROR_SHARE * allowed[order])
             for order, values in enumerate(self.data)
@@ -215,7 +203,7 @@ class _Part:
         upper = []
         for times, order, values, error in groups:
             # The variables are changes: bounds are differences from the present curve.
-            now = self.spline.at(times, order)
+            now = self.spline(times, order)
             factor = self.span**order / unit
             rows.append(self.rows(times, order))
             lower.append((values - error - now) * factor)
@@ -224,7 +212,7 @@ class _Part:
 
     def _jerks(self, unit: float) -> tuple[Array, Array]:
         """Return curvature and gradient of half the integral of the squared jerk."""
-        inner = np.unique(np.clip(self.spline.knots, self.t[0], self.t[-1]))
+        inner = np.unique(np.clip(self.spline.t, self.t[0], self.t[-1]))
         # Jerks are quadratic in every interval: exact with three nodes.
         nodes, weights = np.polynomial.legendre.leggauss(DEGREE - 2)
         spans = np.diff(inner)
@@ -232,7 +220,7 @@ class _Part:
         times = (inner[:-1, None] + spans[:, None] * (nodes + 1) / 2).ravel()
         strength = (spans[:, None] / self.span * weights / 2).ravel()
         third = self.rows(times, 3)
-        now = self.spline.at(times, 3) * self.span**3 / unit
+        now = self.spline(times, 3) * self.span**3 / unit
         # With jerks j + R x, half the squared integral has the Hessian R^T W R and the
         # gradient R^T W j.
         return third.T @ (strength[:, None] * third), third.T @ (strength * now)
