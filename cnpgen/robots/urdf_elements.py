@@ -65,16 +65,20 @@ def check_elements(
     *,
     allow_unused: Collection[str] = (),
 ) -> None:
-    """Raise RecipeError for parts of a file whose names are near one that is read, may occur beside them, and does not.
+    """Raise RecipeError for parts of a file that are misspelt, or repeat one of which the first alone is read.
 
-    The caller accepts the loss of parts with some names.
+    A misspelt name is near one that is read, may occur beside it, and does not. The
+    caller accepts the loss of misspelt parts with some names.
     """
+    if tree.tag != "robot":
+        raise RecipeError([f"{path}: its root is <{tree.tag}>, expected <robot>"])
     hints = {
         text: nearest(name, names, similarity=MISSPELT)
         for text, name, names in _unknown(tree, known)
         if name not in allow_unused
     }
-    if parts := [f"{text}{hint}" for text, hint in hints.items() if hint]:
+    parts = [f"{text}{hint}" for text, hint in hints.items() if hint]
+    if parts := [*parts, *_repeated(tree, known)]:
         named = listed(parts, MAX_LISTED_TAGS)
         remedy = "rename or remove it, or accept its loss by allow_unused in [robot] (--allow-unused of 'cnpgen init')"
         raise RecipeError([f"{path}: {named} would not be read: {remedy}"])
@@ -105,3 +109,20 @@ def _unknown(
             yield f"<{child.tag}> in <{element.tag}>", child.tag, missing
         else:
             yield from _unknown(child, table)
+
+
+def _repeated(element: Element, table: Mapping[str, tuple[str, ...]]) -> Iterator[str]:
+    """Yield texts of known elements that occur twice in one that has one of them, or one shape."""
+    known = table.get(element.tag, ())
+    counts = Counter(
+        "geometry" if element.tag == "geometry" else child.tag
+        for child in element
+        if child.tag in known and child.tag not in {*_REPEATED, *_OPAQUE}
+    )
+    for tag, count in counts.items():
+        if count > 1:
+            what = "shape" if tag == element.tag else f"<{tag}>"
+            yield f"a second {what} in <{element.tag}>"
+    for child in element:
+        if child.tag in known:
+            yield from _repeated(child, table)
