@@ -43,6 +43,7 @@ _KNOWN: dict[str, tuple[str, ...]] = {
     "capsule": ("radius", "length"),
     "mesh": ("filename", "scale"),
 }
+_ANYWHERE = {"name", "type", "version", "group"}  # change nothing elsewhere
 _OPAQUE = {"material", "calibration"}  # colors, and the zero of a sensor
 MAX_LISTED_TAGS = 10
 
@@ -65,15 +66,15 @@ def check_elements(
     *,
     allow_unused: Collection[str] = (),
 ) -> None:
-    """Raise RecipeError for parts of a file that are misspelt, or repeat one of which the first alone is read.
+    """Raise RecipeError for parts of a file that are misspelt or misplaced, or repeat one of which the first alone is read.
 
     A misspelt name is near one that is read, may occur beside it, and does not. The
-    caller accepts the loss of misspelt parts with some names.
+    caller accepts the loss of misspelt and misplaced parts with some names.
     """
     if tree.tag != "robot":
         raise RecipeError([f"{path}: its root is <{tree.tag}>, expected <robot>"])
     hints = {
-        text: nearest(name, names, similarity=MISSPELT)
+        text: nearest(name, names, similarity=MISSPELT) or _other_place(name, known)
         for text, name, names in _unknown(tree, known)
         if name not in allow_unused
     }
@@ -111,17 +112,23 @@ def _unknown(
             yield from _unknown(child, table)
 
 
+def _other_place(name: str, table: Mapping[str, tuple[str, ...]]) -> str:
+    """Return the element in which a part is read, for messages, or an empty text."""
+    places = [tag for tag, names in table.items() if name in names]
+    return f" (it belongs in <{places[0]}>)" if places and name not in _ANYWHERE else ""
+
+
 def _repeated(element: Element, table: Mapping[str, tuple[str, ...]]) -> Iterator[str]:
-    """Yield texts of known elements that occur twice in one that has one of them, or one shape."""
+    """Yield texts of known elements that occur twice in a link or joint, or of a second shape."""
     known = table.get(element.tag, ())
     counts = Counter(
-        "geometry" if element.tag == "geometry" else child.tag
+        "shape" if element.tag == "geometry" else f"<{child.tag}>"
         for child in element
         if child.tag in known and child.tag not in {*_REPEATED, *_OPAQUE}
     )
-    for tag, count in counts.items():
-        if count > 1:
-            what = "shape" if tag == element.tag else f"<{tag}>"
+    for what, count in counts.items():
+        # A robot has several links, groups and states.
+        if count > 1 and element.tag != "robot":
             yield f"a second {what} in <{element.tag}>"
     for child in element:
         if child.tag in known:

@@ -18,7 +18,7 @@ from cnpgen.problems.problem_file import load_problem
 from cnpgen.robots.robot import Robot
 from cnpgen.robots.robot_spec import LimitSources
 from cnpgen.robots.urdf import urdf_tree
-from cnpgen.robots.urdf_changes import SRDF_NAMES
+from cnpgen.robots.urdf_changes import SRDF_NAMES, with_disabled_pairs
 from cnpgen.robots.urdf_elements import _KNOWN, check_elements, unread_elements
 
 BOX = '<geometry><box size="0.4 0.08 0.08"/></geometry>'
@@ -405,6 +405,56 @@ def test_misspelt_elements_of_a_urdf_are_refused(
     path = write(tmp_path / "a.urdf", **changes)
     with pytest.raises(RecipeError, match=re.escape(text)):
         initial(path)
+
+
+@pytest.mark.parametrize(
+    ("changes", "text"),
+    [
+        (
+            {
+                "upper": UPPER
+                + SHAPE.replace("<geometry>", "<geometry><sphere radius='9'/>")
+            },
+            "a second shape in <geometry>",
+        ),
+        (
+            {
+                "upper": UPPER
+                + SHAPE.replace(
+                    "<geometry>", "<origin/><origin xyz='9 0 0'/><geometry>"
+                )
+            },
+            "a second <origin> in <collision>",
+        ),
+        (
+            {"limit": LIMIT + "<mimic joint='j2'/><mimic joint='j1'/>"},
+            "a second <mimic> in <joint>",
+        ),
+        ({"more": "<axis xyz='0 0 1'/>"}, "<axis> in <robot> (it belongs in <joint>)"),
+        (
+            {"limit": LIMIT.replace("/>", " soft_lower_limit='0'/>")},
+            "'soft_lower_limit' of <limit> (it belongs in <safety_controller>)",
+        ),
+    ],
+)
+def test_repeated_and_misplaced_elements_of_a_urdf_are_refused(
+    tmp_path: Path, changes: dict[str, str], text: str
+) -> None:
+    path = write(tmp_path / "arm.urdf", **changes)
+    with pytest.raises(RecipeError, match=re.escape(text)):
+        initial(path)
+
+
+def test_the_root_of_urdf_and_srdf_is_a_robot(tmp_path: Path) -> None:
+    path = write(tmp_path / "arm.urdf")
+    srdf = tmp_path / "arm.srdf"
+    pair = "<disable_collisions link1='base' link2='upper'/>"
+    groups = "<group name='a'/><group name='b'/>"
+    srdf.write_text(f"<robot name='arm'>{groups}{pair}</robot>")
+    with_disabled_pairs(path.read_text(), srdf)
+    srdf.write_text(f"<robt name='arm'>{pair}</robt>")
+    with pytest.raises(RecipeError, match="its root is <robt>, expected <robot>"):
+        with_disabled_pairs(path.read_text(), srdf)
 
 
 def test_the_loss_of_a_misspelt_element_is_accepted_by_name_and_recorded(
