@@ -29,7 +29,10 @@ _KNOWN: dict[str, tuple[str, ...]] = {
     "axis": ("xyz",),
     "parent": ("link",),
     "child": ("link",),
-    "limit": ("lower", "upper", "effort", "velocity", "acceleration", "jerk"),
+    "limit": (
+        *("lower", "upper", "effort", "velocity"),
+        *("acceleration", "deceleration", "jerk"),
+    ),
     "dynamics": ("damping", "friction"),
     "mimic": ("joint", "multiplier", "offset"),
     "safety_controller": (

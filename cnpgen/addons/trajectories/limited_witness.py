@@ -30,7 +30,9 @@ REFINED_SPANS = 3  # on both sides of a violation, with further knots
 PARTS = 6  # of these spans between knots, times the size
 MAX_WINDOWS = 12  # of a joint
 MAX_SIZE = 3  # of a window, in multiples of the numbers of spans
-MAX_COUPLED_EXCESS = 0.2  # relative; a motion with a larger one exceeds the limit itself
+MAX_COUPLED_EXCESS = (
+    0.2  # relative; a motion with a larger one exceeds the limit itself
+)
 
 
 def limited_witness(

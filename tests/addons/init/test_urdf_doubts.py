@@ -445,6 +445,40 @@ def test_repeated_and_misplaced_elements_of_a_urdf_are_refused(
         initial(path)
 
 
+def test_the_jerk_and_deceleration_of_a_urdf_limit_the_arm(tmp_path: Path) -> None:
+    limit = LIMIT.replace("/>", ' acceleration="8" deceleration="7" jerk="250"/>')
+    path = write(tmp_path / "a.urdf", limit=limit)
+    problem = initial(path).problem
+    robot = load_robot(problem)
+    assert robot.acceleration_limit[0] == 7.0
+    assert robot.jerk_limit[0] == 250.0
+    assert problem.limits.sources.jerk == (
+        "guess: the URDF for j1; 100/s times the acceleration limits for j2"
+    )
+    assert "is not read" not in notes(path)
+    wrong = write(path, limit=limit.replace("deceleration", "deceleraton"))
+    with pytest.raises(RecipeError, match="did you mean 'deceleration'"):
+        initial(wrong)
+
+
+def test_a_follower_needs_a_leader_that_the_urdf_has(tmp_path: Path) -> None:
+    mimic = "<mimic joint='g9' multiplier='-1' offset='0.2'/>"
+    path = write(tmp_path / "a.urdf", more=finger() + finger("f2", "g2", mimic=mimic))
+    with pytest.raises(RecipeError, match=r"joint 'g2': .* 'g9', which the URDF lacks"):
+        initial(path)
+
+
+def test_no_planned_joint_is_passive(tmp_path: Path) -> None:
+    path = write(tmp_path / "a.urdf")
+    srdf = tmp_path / "a.srdf"
+    srdf.write_text("<robot name='arm'><passive_joint name='j2'/></robot>")
+    with_disabled_pairs(path.read_text(), srdf, planned=["j1"])
+    with pytest.raises(
+        RecipeError, match="<passive_joint> names the planned joint 'j2'"
+    ):
+        with_disabled_pairs(path.read_text(), srdf, planned=["j1", "j2"])
+
+
 def test_the_root_of_urdf_and_srdf_is_a_robot(tmp_path: Path) -> None:
     path = write(tmp_path / "arm.urdf")
     srdf = tmp_path / "arm.srdf"
