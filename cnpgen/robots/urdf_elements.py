@@ -82,6 +82,8 @@ def check_elements(
         if name not in allow_unused
     }
     parts = [f"{text}{hint}" for text, hint in hints.items() if hint]
+    if "mimic" not in allow_unused:
+        parts += _unknown_leaders(tree)
     if parts := [*parts, *_repeated(tree, known)]:
         named = listed(parts, MAX_LISTED_TAGS)
         remedy = "rename or remove it, or accept its loss by allow_unused in [robot] (--allow-unused of 'cnpgen init')"
@@ -92,7 +94,8 @@ def unknown_names(
     tree: Element, known: Mapping[str, tuple[str, ...]] = _KNOWN
 ) -> list[str]:
     """Return the names of the elements and attributes that are not read."""
-    return [name for _, name, _ in _unknown(tree, known)]
+    names = [name for _, name, _ in _unknown(tree, known)]
+    return [*names, *("mimic" for _ in _unknown_leaders(tree))]
 
 
 def _unknown(
@@ -119,6 +122,16 @@ def _other_place(name: str, table: Mapping[str, tuple[str, ...]]) -> str:
     """Return the element in which a part is read, for messages, or an empty text."""
     places = [tag for tag, names in table.items() if name in names]
     return f" (it belongs in <{places[0]}>)" if places and name not in _ANYWHERE else ""
+
+
+def _unknown_leaders(tree: Element) -> Iterator[str]:
+    """Yield texts of joints that mimic one which the file lacks: parsers drop the <mimic>."""
+    names = [joint.get("name", "") for joint in tree.findall("joint")]
+    for joint in tree.findall("joint"):
+        mimic = joint.find("mimic")
+        if mimic is not None and (leader := mimic.get("joint", "")) not in names:
+            text = f"the <mimic> of {joint.get('name')!r}, which names no joint of the file, {leader!r}"
+            yield f"{text}{nearest(leader, names)},"
 
 
 def _repeated(element: Element, table: Mapping[str, tuple[str, ...]]) -> Iterator[str]:

@@ -122,20 +122,9 @@ def urdf_parameters(tree: Element) -> UrdfParameters:
     errors += [
         f"link {link!r}: its joints form a cycle" for link in _links_in_cycles(joints)
     ]
-    errors += _unknown_leaders(tree)
     if errors:
         raise RecipeError(errors)
     return UrdfParameters(inertias, joints)
-
-
-def _unknown_leaders(tree: Element) -> Iterator[str]:
-    """Yield error messages for joints that mimic one which the file lacks: parsers drop the <mimic>."""
-    names = [joint.get("name", "") for joint in tree.findall("joint")]
-    for joint in tree.findall("joint"):
-        mimic = joint.find("mimic")
-        if mimic is not None and (leader := mimic.get("joint", "")) not in names:
-            text = f"its <mimic> names the joint {leader!r}, which the URDF lacks"
-            yield f"joint {joint.get('name', '')!r}: {text}{nearest(leader, names)}"
 
 
 def _links_in_cycles(joints: Mapping[str, UrdfJoint]) -> list[str]:
