@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING
 from cnpgen.cli import recipe_names, values, verdict_text
 from cnpgen.cli.parser import EXTRAPOLATE, Parser, add_json, refuse
 from cnpgen.cli.terminal import Meter
-from cnpgen.errors import DatasetError, UsageError
+from cnpgen.errors import DatasetError, UsageError, counted
 
 if TYPE_CHECKING:
     from cnpgen.plans.evaluate import Evaluation
@@ -90,7 +90,7 @@ def _evaluate(arguments: argparse.Namespace) -> "Evaluation":
     )
     if arguments.plan is not None and arguments.plan >= len(plans):
         raise UsageError(
-            f"{arguments.file} has no plan {arguments.plan}: {len(plans)} plans are numbered from 0"
+            f"{arguments.file} has no plan {arguments.plan}: {counted(len(plans), 'plan')}, numbered from 0"
         )
     # Without a terminal the summary alone is printed.
     with Meter(quiet=arguments.quiet or not sys.stderr.isatty(), noun="plan") as meter:

@@ -204,8 +204,10 @@ def _given(
     count = max(map(len, given.values()))
     for name, values in given.items():
         if len(values) not in {1, count}:
-            text = f"is given for {counted(len(values), 'task')}, another column for {count:,}"
-            raise UsageError(text, argument=name)
+            raise UsageError(
+                f"is given for {counted(len(values), 'task')}, another column for {count:,}",
+                argument=name,
+            )
     check_plausible(
         robot, given, {name: field.unit for name, field in fields.items()}, noun="task"
     )

@@ -91,7 +91,8 @@ def _fix(joint: Element, position: float, is_stored: bool) -> list[str]:
     """Make a joint fixed at a position; return its errors."""
     import pinocchio as pin
 
-    name, kind = joint.get("name", ""), joint.get("type", "")
+    name = joint.get("name", "")
+    kind = joint.get("type", "")
     if kind == "fixed" and is_stored:
         return []
     if kind not in _TURNING + _SLIDING:
@@ -99,7 +100,8 @@ def _fix(joint: Element, position: float, is_stored: bool) -> list[str]:
             f"joint {name!r} is {kind} and has no position, expected a revolute, continuous or prismatic joint"
         ]
     limit = joint.find("limit")
-    low, high = number_in(limit, "lower", 0.0), number_in(limit, "upper", 0.0)
+    low = number_in(limit, "lower", 0.0)
+    high = number_in(limit, "upper", 0.0)
     if kind != "continuous" and not low - 1e-9 <= position <= high + 1e-9:
         unit = "m" if kind in _SLIDING else "rad"
         return [
@@ -118,14 +120,8 @@ def _fix(joint: Element, position: float, is_stored: bool) -> list[str]:
     for part in [part for part in joint if part.tag in (*_MOTION, "origin")]:
         joint.remove(part)
     joint.set("type", "fixed")
-    joint.insert(
-        0,
-        Element(
-            "origin",
-            xyz=numbers_text(xyz),
-            rpy=numbers_text(pin.rpy.matrixToRpy(rotation)),
-        ),
-    )
+    rpy = numbers_text(pin.rpy.matrixToRpy(rotation))
+    joint.insert(0, Element("origin", xyz=numbers_text(xyz), rpy=rpy))
     return []
 
 

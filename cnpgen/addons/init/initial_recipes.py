@@ -17,7 +17,7 @@ from cnpgen.addons.init.stated_sources import (
     TORQUE_STATES,
     stated_sources,
 )
-from cnpgen.arrays import Array
+from cnpgen.arrays import Array, Names
 from cnpgen.errors import RecipeError
 from cnpgen.make.recipe import DatasetRecipe
 from cnpgen.pipelines.pipeline import Pipeline
@@ -63,7 +63,7 @@ class InitialProblem:
     problem: Problem
     arm: Arm  # with placeholders of missing limits
     overlaps: LinkOverlaps | None  # None without link geometry
-    notes: tuple[str, ...]
+    notes: Names
 
 
 def problem_of(
@@ -73,8 +73,8 @@ def problem_of(
     packages: tuple[Path, ...],
     srdf: Path | None,
     *,
-    skipped_meshes: tuple[str, ...] = (),
-    allow_unused: tuple[str, ...] = (),
+    skipped_meshes: Names = (),
+    allow_unused: Names = (),
     joint_limits: StatedJointLimits | None = None,
 ) -> InitialProblem:
     """Make the problem of an arm, or raise RecipeError if it cannot be planned for.
@@ -115,7 +115,7 @@ def problem_of(
     return InitialProblem(problem, arm, overlaps, every)
 
 
-def _with_torque(problem: Problem, robot: Robot) -> tuple[Problem, tuple[str, ...]]:
+def _with_torque(problem: Problem, robot: Robot) -> tuple[Problem, Names]:
     """Return a problem with the limit of torques, or a note of the reason why it is omitted."""
     # Torques of links without masses are meaningless.
     if not robot.chain.joints[-1].mass > 0:
@@ -127,7 +127,7 @@ def _with_torque(problem: Problem, robot: Robot) -> tuple[Problem, tuple[str, ..
     return replace(problem, constraint=constraints), ()
 
 
-def _check_allowed(keys: tuple[str, ...], urdf: Path, srdf: Path | None) -> None:
+def _check_allowed(keys: Names, urdf: Path, srdf: Path | None) -> None:
     """Raise UsageError for names that neither file has as those of parts that are not read."""
     unread = unknown_names(urdf_tree(read_urdf(urdf)))
     if srdf is not None and keys:
@@ -163,7 +163,7 @@ def _problem(
     packages: tuple[Path, ...],
     srdf: Path | None,
     *,
-    skipped_meshes: tuple[str, ...],
+    skipped_meshes: Names,
 ) -> Problem:
     """Return the problem without torques, with the base configuration at the centre of all limits."""
     centre = tuple((joint.lower + joint.upper) / 2 for joint in arm.planned)

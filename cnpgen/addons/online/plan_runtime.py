@@ -31,7 +31,7 @@ from cnpgen.planner.planner import Planner
 from cnpgen.plans.join import JoinedPlans
 from cnpgen.plans.plans import Plans
 from cnpgen.problems.problem import Problem
-from cnpgen.problems.problem_record import as_record, open_problem
+from cnpgen.problems.problem_record import ProblemRecord, as_record, open_problem
 from cnpgen.schema.argument_types import checked_arguments
 from cnpgen.schema.arguments import (
     check_range,
@@ -103,10 +103,7 @@ class PlanRuntime:
         keep_stops: bool = True,
         grid_step: float = MAX_GRID_STEP_S,
     ) -> None:
-        with concerning("planner"):
-            record = as_record(
-                planner.model.problem if isinstance(planner, Planner) else planner
-            )
+        record = _record_of(planner)
         self._robot = robot = open_problem(record)[1]
         check_range("grid_step", number("grid_step", grid_step), *GRID_STEPS_S, "s")
         self._judge = judge
@@ -130,8 +127,7 @@ class PlanRuntime:
         self._kept_stops = KeptStops(self._checker, measured=judge)
         self._keeps_stops = keep_stops
         self._requests = ReplanRequests()
-        # Until the runtime is resumed.
-        self._stop: Stop | None = None
+        self._stop: Stop | None = None  # until the runtime is resumed
         self._stops = 0
         self._closed = False
 
@@ -386,6 +382,14 @@ class PlanRuntime:
         except (Exception, SystemExit) as error:  # noqa: BLE001 - errors of the caller's function are results
             kind = "" if isinstance(error, CnpgenError) else f"{type(error).__name__}: "
             return Switch(SwitchOutcome.FAILED, at, f"{kind}{error}")
+
+
+def _record_of(planner: object) -> ProblemRecord:
+    """Return the record of a planner's problem, or of a problem."""
+    with concerning("planner"):
+        return as_record(
+            planner.model.problem if isinstance(planner, Planner) else planner
+        )
 
 
 def _report(motion: SampledMotion, begin: float, detail: str = "") -> Stop:

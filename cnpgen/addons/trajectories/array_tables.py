@@ -10,6 +10,7 @@ import numpy as np
 from cnpgen.addons.trajectories.load_options import LoadOptions
 from cnpgen.addons.trajectories.table_units import plain
 from cnpgen.addons.trajectories.trajectory_table import TrajectoryTable, Values
+from cnpgen.arrays import Names
 from cnpgen.errors import UsageError
 from cnpgen.plans.format import PHASE_COLUMN
 from cnpgen.plans.stated_units import UNIT_ATTRIBUTES
@@ -77,7 +78,7 @@ def read_hdf5_tables(path: Path, _: LoadOptions) -> Iterator[TrajectoryTable]:
 
 
 def _split(
-    path: Path, arrays: dict[str, Values], names: tuple[str, ...]
+    path: Path, arrays: dict[str, Values], names: Names
 ) -> Iterator[TrajectoryTable]:
     """Yield the trajectories of an archive: ``plan_00000_t`` and so on, or ``t`` and ``q`` of all."""
     parts: dict[str, dict[str, Values]] = {}

@@ -33,6 +33,7 @@ from cnpgen.addons.trajectories.refuted_limits import (
     BOTH,
     VELOCITIES,
     RefutedLimit,
+    absolute_limits,
     largest_values,
     refuted_limits,
 )
@@ -104,7 +105,7 @@ def judge_samples(
     """Judge the motion that samples resolve.
 
     Jitter must be part of the errors of the values (``with_jitter``) but for the curves
-    that meet samples within it. For the scene see ``FamilyJudge``.
+    that meet samples within it. The scene is that of ``FamilyJudge``.
     """
     limits = judge.limits(trajectory.parameters)
     ends = acceleration_limits(limits)
@@ -163,19 +164,11 @@ def acceleration_limits(
     limits: ProvenJointLimits, tolerance_share: float = TOLERANCE_SHARE
 ) -> AccelerationLimits:
     """Return the smallest acceleration and jerk limits of a problem with most of their tolerances."""
-    n = len(limits.joints)
-    smallest = {"ddq": np.full(n, np.inf), "jerk": np.full(n, np.inf)}
-    for constraint, bounds, tolerance in zip(
-        limits.constraints, limits.bounds, limits.tolerance, strict=True
-    ):
-        quantity = quantity_of(constraint)
-        if quantity in smallest:
-            # Limits of both signs may differ, and the curve uses one number for both.
-            allowed = np.minimum(-bounds[:n], bounds[n:]) + tolerance_share * tolerance
-            smallest[quantity] = np.minimum(
-                smallest[quantity], np.maximum(allowed, 0.0)
-            )
-    return AccelerationLimits(smallest["ddq"], smallest["jerk"])
+    # Limits of both signs may differ, and the curve uses one number for both.
+    smallest = absolute_limits(limits, np.minimum, tolerance_share)
+    return AccelerationLimits(
+        np.maximum(smallest["ddq"], 0.0), np.maximum(smallest["jerk"], 0.0)
+    )
 
 
 def _is_dense(trajectory: Trajectory) -> bool:

@@ -8,6 +8,8 @@ other coefficients stay, so the curve keeps its derivatives. Accelerations are l
 joint by joint, then torques, for all joints together.
 """
 
+from typing import TYPE_CHECKING
+
 import numpy as np
 
 from cnpgen.addons.trajectories.curve_family import CurveFamily
@@ -18,21 +20,22 @@ from cnpgen.addons.trajectories.window_program import (
     JointSplines,
     Limits,
     Part,
-    Spline,
     TorqueBounds,
+    refined,
     smoothest,
 )
-from cnpgen.addons.trajectories.witness import MIN_ERRORS, fitted, is_within
+from cnpgen.addons.trajectories.witness import DEGREE, MIN_ERRORS, fitted, is_within
 from cnpgen.arrays import Array
+
+if TYPE_CHECKING:
+    from scipy.interpolate import BSpline
 
 WINDOW_SPANS = 10  # on both sides of a violation
 REFINED_SPANS = 3  # on both sides of a violation, with further knots
 PARTS = 6  # of these spans between knots, times the size
 MAX_WINDOWS = 12  # of a joint
 MAX_SIZE = 3  # of a window, in multiples of the numbers of spans
-MAX_COUPLED_EXCESS = (
-    0.2  # relative; a motion with a larger one exceeds the limit itself
-)
+MAX_COUPLED_EXCESS = 0.2  # relative; a larger one is that of the motion itself
 
 
 def limited_witness(
@@ -47,6 +50,8 @@ def limited_witness(
     without a spline within the errors, with a jitter of the times, or if the program
     finds none.
     """
+    from scipy.interpolate import BSpline
+
     smooth = None if errors.t else fitted(trajectory, errors, 0.0)
     if smooth is None or not np.isfinite(limit).all():
         return None
@@ -55,7 +60,7 @@ def limited_witness(
     data = [[values[:, joint] for values in data_of(trajectory)] for joint in range(n)]
     splines = []
     for joint in range(n):
-        spline = Spline(smooth.knots, smooth.coefficients[:, joint])
+        spline = BSpline(smooth.t, smooth.c[:, joint], DEGREE)
         limits = Limits(limit[joint : joint + 1])
         limited = _limited(
             [spline], trajectory.t, data[joint : joint + 1], allowed, limits
@@ -68,21 +73,21 @@ def limited_witness(
         splines = _limited(splines, trajectory.t, data, allowed, limits) or splines
     # The programs meet errors up to their tolerance, so all samples are compared again.
     joints = JointSplines(splines)
-    if not is_within(joints, trajectory, errors):
+    if not is_within(joints.at, trajectory, errors):
         return None
     # Between knots of any joint, every spline is one quintic. Its q, dq and ddq at both
     # ends determine it exactly.
-    times = np.unique(np.concatenate([spline.knots for spline in splines]))
+    times = np.unique(np.concatenate([spline.t for spline in splines]))
     return family_of_data(times, joints.at(times))
 
 
 def _limited(
-    splines: list[Spline],
+    splines: list["BSpline"],
     t: Array,
     data: list[list[Array]],
     allowed: Array,
     limits: Limits,
-) -> list[Spline] | None:
+) -> "list[BSpline] | None":
     """Return the splines of some joints within the limits, or None."""
     for _ in range(MAX_WINDOWS):
         joints = JointSplines(splines)
@@ -102,7 +107,7 @@ def _limited(
             near = _around(t, sample, size * REFINED_SPANS)
             steps = np.diff(near)[:, None] * np.arange(1, PARTS * size) / (PARTS * size)
             times = (near[:-1, None] + steps).ravel()
-            splines = [spline.refined(times) for spline in splines]
+            splines = [refined(spline, times) for spline in splines]
             window = _around(t, sample, size * WINDOW_SPANS)
             chosen = np.isin(t, window)
             parts = [

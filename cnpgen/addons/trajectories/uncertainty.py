@@ -10,10 +10,9 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from cnpgen.addons.trajectories.curve_family import UNDEFINED, CurveFamily
-from cnpgen.arrays import Array
+from cnpgen.arrays import Array, Indices
 from cnpgen.judges.plans.continuous_collision import is_contact
 from cnpgen.judges.plans.evaluated_trajectory import EvaluatedTrajectory
 from cnpgen.judges.plans.measure import MeasuredCondition, measure
@@ -109,7 +108,7 @@ def _friction_changes(
     world: PathWorld,
     condition: MeasuredCondition,
     s: Array,
-    starts: NDArray[np.intp],
+    starts: Indices,
 ) -> Array | float:
     """Bound the changes of the friction of drives in every block, shape (m, B); 0 for other conditions.
 
@@ -135,7 +134,7 @@ def _friction_changes(
     # Friction enters the power times the velocity.
     if condition.condition.unit == POWER_UNIT:
         changes = [change * (np.abs(dq) + error)[joints] for change in changes]
-    return np.asarray(np.maximum.reduceat(np.max(changes, axis=0), starts, axis=1))
+    return np.maximum.reduceat(np.max(changes, axis=0), starts, axis=1)
 
 
 def _changes(  # noqa: PLR0917 - as of uncertainty_of
@@ -145,7 +144,7 @@ def _changes(  # noqa: PLR0917 - as of uncertainty_of
     scenes: Sequence[Array],
     smooth: Sequence[MeasuredCondition],
     s: Array,
-    starts: NDArray[np.intp],
+    starts: Indices,
 ) -> list[Array]:
     """Bound the errors of smooth conditions in every block, shape (m, B) each."""
     # The middle of every block.

@@ -7,14 +7,16 @@ accelerations: tau = M(q) ddq + n(q, dq).
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from cnpgen.addons.trajectories.refuted_torques import Torques
 from cnpgen.addons.trajectories.witness import DEGREE
-from cnpgen.arrays import Array
+from cnpgen.arrays import Array, Indices
+
+if TYPE_CHECKING:
+    from scipy.interpolate import BSpline
 
 POINTS_PER_INTERVAL = 8  # of knots, at which the limits hold
 PROGRAM_TOLERANCE = 1e-9
@@ -24,46 +26,31 @@ PROGRAM_LIMIT_SHARE = 1 - 1e-4  # of the limit, in the program: it holds at poin
 ERROR_SHARE = 0.999  # of the errors, for the rounding of the program
 
 
-@dataclass(frozen=True, eq=False)
-class Spline:
-    """Spline of one joint."""
+def refined(spline: "BSpline", times: Array) -> "BSpline":
+    """Return the same curve with further knots."""
+    from scipy.interpolate import BSpline
 
-    knots: Array
-    coefficients: Array
-
-    def at(self, t: Array, order: int = 0) -> Array:
-        """Evaluate a derivative at times [s]."""
-        from scipy.interpolate import BSpline
-
-        spline = BSpline(self.knots, self.coefficients, DEGREE)
-        return np.asarray(spline(t, order))
-
-    def refined(self, times: Array) -> "Spline":
-        """Return the same curve with further knots."""
-        from scipy.interpolate import BSpline
-
-        spline = BSpline(self.knots, self.coefficients, DEGREE)
-        for time in times[~np.isin(times, self.knots)]:
-            spline = spline.insert_knot(float(time))
-        return Spline(spline.t, spline.c[: len(spline.t) - DEGREE - 1])
+    for time in times[~np.isin(times, spline.t)]:
+        spline = spline.insert_knot(float(time))
+    return BSpline(spline.t, spline.c[: len(spline.t) - DEGREE - 1], DEGREE)
 
 
 @dataclass(frozen=True, eq=False)
 class JointSplines:
     """Splines of m joints with different knots."""
 
-    splines: Sequence[Spline]
+    splines: Sequence["BSpline"]
 
     def at(self, t: Array) -> list[Array]:
         """Return positions, velocities and accelerations, shape (K, m) each."""
         return [
-            np.stack([spline.at(t, order) for spline in self.splines], axis=1)
+            np.stack([spline(t, order) for spline in self.splines], axis=1)
             for order in range(3)
         ]
 
     def points(self, low: float, high: float) -> Array:
         """Return points between two times, several in every interval of knots."""
-        knots = np.concatenate([spline.knots for spline in self.splines])
+        knots = np.concatenate([spline.t for spline in self.splines])
         inside = np.unique(knots[(knots >= low) & (knots <= high)])
         parts = np.arange(POINTS_PER_INTERVAL) / POINTS_PER_INTERVAL
         points = inside[:-1, None] + np.diff(inside)[:, None] * parts
@@ -128,7 +115,7 @@ class Limits:
 class Part:
     """Part of the spline of one joint between two samples, with the data at the samples in between."""
 
-    spline: Spline
+    spline: "BSpline"
     t: Array
     data: list[Array]
 
@@ -138,10 +125,10 @@ class Part:
         return float(np.diff(self.t).mean())
 
     @property
-    def free(self) -> NDArray[np.intp]:
+    def free(self) -> Indices:
         """Indices of the coefficients whose supports are between both ends."""
-        knots = self.spline.knots
-        index = np.arange(len(self.spline.coefficients))
+        knots = self.spline.t
+        index = np.arange(len(self.spline.c))
         inside = (knots[index] >= self.t[0]) & (knots[index + DEGREE + 1] <= self.t[-1])
         return np.asarray(index[inside], np.intp)
 
@@ -149,8 +136,8 @@ class Part:
         """Return derivatives of the free basis functions, with a span as unit of time."""
         from scipy.interpolate import BSpline
 
-        size = len(self.spline.coefficients)
-        basis = BSpline(self.spline.knots, np.eye(size)[:, self.free], DEGREE)
+        size = len(self.spline.c)
+        basis = BSpline(self.spline.t, np.eye(size)[:, self.free], DEGREE)
         return np.asarray(basis(times, order) * self.span**order)
 
     def errors(self, allowed: Array, unit: float) -> tuple[Array, Array, Array]:
@@ -160,7 +147,7 @@ class Part:
         upper = []
         for order, values in enumerate(self.data):
             # The variables are changes: bounds are differences from the present curve.
-            now = self.spline.at(self.t, order)
+            now = self.spline(self.t, order)
             factor = self.span**order / unit
             # Near the ends of the window, samples keep errors that it cannot change.
             error = np.maximum(ERROR_SHARE * allowed[order], np.abs(values - now))
@@ -169,15 +156,17 @@ class Part:
             upper.append((values + error - now) * factor)
         return np.concatenate(rows), np.concatenate(lower), np.concatenate(upper)
 
-    def changed(self, change: Array) -> Spline:
+    def changed(self, change: Array) -> "BSpline":
         """Return the spline with changed free coefficients."""
-        coefficients = self.spline.coefficients.copy()
+        from scipy.interpolate import BSpline
+
+        coefficients = self.spline.c.copy()
         coefficients[self.free] += change
-        return Spline(self.spline.knots, coefficients)
+        return BSpline(self.spline.t, coefficients, DEGREE)
 
     def jerks(self, unit: float) -> tuple[Array, Array]:
         """Return curvature and gradient of half the integral of the squared jerk."""
-        inner = np.unique(np.clip(self.spline.knots, self.t[0], self.t[-1]))
+        inner = np.unique(np.clip(self.spline.t, self.t[0], self.t[-1]))
         # Jerks are quadratic in every interval: exact with three nodes.
         nodes, weights = np.polynomial.legendre.leggauss(DEGREE - 2)
         spans = np.diff(inner)
@@ -185,7 +174,7 @@ class Part:
         times = (inner[:-1, None] + spans[:, None] * (nodes + 1) / 2).ravel()
         strength = (spans[:, None] / self.span * weights / 2).ravel()
         third = self.rows(times, 3)
-        now = self.spline.at(times, 3) * self.span**3 / unit
+        now = self.spline(times, 3) * self.span**3 / unit
         # With jerks j + R x, half the squared integral has the Hessian R^T W R and the
         # gradient R^T W j.
         return third.T @ (strength[:, None] * third), third.T @ (strength * now)
@@ -193,7 +182,7 @@ class Part:
 
 def smoothest(
     parts: list["Part"], allowed: Array, limits: Limits, core: tuple[float, float]
-) -> list[Spline] | None:
+) -> "list[BSpline] | None":
     """Return the splines with the smallest jerks that meet the errors, and the limits between two times, or None."""
     import daqp
     from scipy.linalg import block_diag
