@@ -226,9 +226,9 @@ def with_disabled_pairs(
             [f"{srdf}: is a URDF, expected an SRDF with <{_TAG}> elements"]
         )
     _account_srdf(tree, srdf, allow_unused)
-    passive = {each.get("name") for each in tree.iter("passive_joint")}
-    if named := sorted(passive.intersection(planned)):
-        text = f"<passive_joint> names the planned joint {named[0]!r}"
+    passive = {each.get("name", "") for each in tree.iter("passive_joint")}
+    if moved := sorted(passive.intersection(planned)):
+        text = f"<passive_joint> names the planned joint {moved[0]!r}"
         raise RecipeError([f"{srdf}: {text}: no motor moves it, remove one of both"])
     entries = [dict(entry.attrib) for entry in tree.iter(_TAG)]
     links = {link.get("name", "") for link in urdf_tree(urdf).iter("link")}

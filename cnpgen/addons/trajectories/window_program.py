@@ -76,11 +76,12 @@ class Limits:
         """Return the largest excess over a limit, relative to it, at K states, shape (K,)."""
         shares = np.abs(states[2]) / self.acceleration
         if self.torques is not None:
-            tau = self.torques.torques(*states)
+            q, dq, ddq = states
+            tau = self.torques.torques(q, dq, ddq)
             shares = np.hstack([shares, np.abs(tau) / self.torques.limit])
         return np.asarray(shares.max(axis=1) - 1)
 
-    def rows(self, states: list[Array]) -> list[tuple[Array, Array, Array]]:
+    def rows(self, states: list[Array]) -> list[tuple[Array, Array, Indices]]:
         """Return the limited quantities near their limits as affine functions of the accelerations at K states.
 
         Returns:
@@ -88,7 +89,7 @@ class Limits:
             joints relative to the limit, shapes (C,) and (C, m), and the indices of the
             states, shape (C,).
         """
-        ddq = states[2]
+        q, dq, ddq = states
         unit = np.eye(ddq.shape[1])
         found = []
         quantities = [
@@ -97,9 +98,9 @@ class Limits:
         ]
         if self.torques is not None:
             of, limit = self.torques.torques, self.torques.limit
-            tau = of(*states)
+            tau = of(q, dq, ddq)
             # Columns of the mass matrix: M e_j = tau(ddq + e_j) - tau(ddq).
-            columns = [of(*states[:2], ddq + each) - tau for each in unit]
+            columns = [of(q, dq, ddq + each) - tau for each in unit]
             matrix = np.stack(columns, axis=2) / limit[:, None]
             quantities += [
                 (tau[:, joint] / limit[joint], matrix[:, joint])
