@@ -45,3 +45,6 @@ Names = tuple[str, ...]
 
 AnyPath = str | Path
 """A path of a file or folder, as a caller may pass it."""
+
+NamedNumbers = Mapping[str, float]
+"""Numbers by the names of joints, links or parameters."""

@@ -12,7 +12,7 @@ from xml.etree.ElementTree import Element
 import numpy as np
 
 from cnpgen.addons.init.doubts import doubts
-from cnpgen.arrays import Names
+from cnpgen.arrays import NamedNumbers, Names
 from cnpgen.errors import RecipeError, UsageError, listed
 from cnpgen.problems.checks import frames_of, missing_frame, unread_xacro
 from cnpgen.problems.urdf_dynamics import (
@@ -68,14 +68,14 @@ class Arm:
     locked: Names  # names of all other joints that move: they stay at zero
     moved: Names  # links that planned joints move
     frames: Names  # names of all links and joints
-    masses: Mapping[str, float]  # link -> mass [kg]; 0 where it has none
+    masses: NamedNumbers  # link -> mass [kg]; 0 where it has none
     # Links that planned joints move with inertias that no body has.
     impossible: Names
     shaped: Names  # links that have a ``<collision>`` element
     meshes: Names  # mesh files that links name
     visual: Names  # links that have a ``<visual>`` and no ``<collision>``
     # Locked joints that do not stay at zero -> position [rad or m].
-    locked_positions: Mapping[str, float]
+    locked_positions: NamedNumbers
     doubts: Names  # sentences about numbers that are probably wrong
     friction: tuple[JointFriction, ...]  # friction of planned joints that have any
     joint_notes: Names  # about further elements of planned joints

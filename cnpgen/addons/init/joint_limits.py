@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from cnpgen.addons.init.arm import Arm, ArmJoint
-from cnpgen.arrays import Names
+from cnpgen.arrays import NamedNumbers, Names
 from cnpgen.errors import UsageError, nearest
 from cnpgen.problems.scenes.yaml_document import read_yaml
 
@@ -27,7 +27,7 @@ class StatedJointLimits:
     """Limits of a file for the joints of an arm, by joint and key; only those whose flag is true."""
 
     path: Path
-    values: Mapping[str, Mapping[str, float]]
+    values: Mapping[str, NamedNumbers]
     unused: Names = ()  # sentences about elements of the file
 
     def of(self, key: str) -> dict[str, float]:

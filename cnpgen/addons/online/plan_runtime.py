@@ -18,6 +18,7 @@ from cnpgen.addons.online.replan_requests import ReplanRequests
 from cnpgen.addons.online.set_points import (
     GRID_STEPS_S,
     MAX_GRID_STEP_S,
+    PlanOrSequence,
     SampledMotion,
     SetPoint,
     at_rest,
@@ -28,8 +29,6 @@ from cnpgen.addons.online.timeline import Timeline
 from cnpgen.arrays import Array
 from cnpgen.errors import CnpgenError, UsageError
 from cnpgen.planner.planner import Planner
-from cnpgen.plans.join import JoinedPlans
-from cnpgen.plans.plans import Plans
 from cnpgen.problems.problem import Problem
 from cnpgen.problems.problem_record import ProblemRecord, as_record, open_problem
 from cnpgen.schema.argument_types import checked_arguments
@@ -206,7 +205,7 @@ class PlanRuntime:
             return self._timeline.state_at(times)
 
     @checked_arguments
-    def plan_at(self, time: float) -> tuple[Plans | JoinedPlans | None, float]:
+    def plan_at(self, time: float) -> tuple[PlanOrSequence | None, float]:
         """Return the plan whose path is followed at a time [s], and the time since its start at which it is there [s].
 
         They differ from those of the plan while the arm stops. At rest it is None.

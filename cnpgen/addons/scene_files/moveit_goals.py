@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -17,7 +16,7 @@ from cnpgen.addons.scene_files.moveit_frames import (
     rotation_of,
 )
 from cnpgen.addons.scene_files.moveit_shapes import read_regions
-from cnpgen.arrays import Array, Names
+from cnpgen.arrays import Array, NamedNumbers, Names
 from cnpgen.problems.scenes.scene_problem import GoalPose, SceneError
 
 _PARAMETRIZATIONS = {"0": EULER, "XYZ_EULER_ANGLES": EULER}
@@ -34,7 +33,7 @@ class JointGoals:
 
 
 def read_start(
-    state: Any, where: str, present: Mapping[str, float]
+    state: Any, where: str, present: NamedNumbers
 ) -> tuple[Names, Array, Array | None]:
     """Return names, positions [rad] and velocities [rad/s] of the joints at the start.
 

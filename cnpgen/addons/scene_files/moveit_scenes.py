@@ -9,7 +9,7 @@ fixed transform. Every element is read, refused by name, or one of ``moveit_unus
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -48,7 +48,7 @@ from cnpgen.addons.scene_files.moveit_path import read_path_constraints
 from cnpgen.addons.scene_files.moveit_shapes import built
 from cnpgen.addons.scene_files.moveit_unused import UNUSED_ELEMENTS
 from cnpgen.addons.scene_files.octomap import read_octomap
-from cnpgen.arrays import JsonMapping, Names
+from cnpgen.arrays import JsonMapping, NamedNumbers, Names
 from cnpgen.errors import listed, nearest
 from cnpgen.problems.scenes.scene_problem import (
     MAX_SCENE_OBSTACLES,
@@ -158,7 +158,7 @@ def _problem(
     scene: AccountedMapping,
     path: Path,
     request: AccountedMapping,
-    present: Mapping[str, float],
+    present: NamedNumbers,
 ) -> SceneProblem:
     name = re.sub(r"^(scene|request)[_-]?", "", path.stem) or path.stem
     place = f"{scene_path}: scene {name!r}"

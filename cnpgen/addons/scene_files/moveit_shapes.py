@@ -109,8 +109,15 @@ def read_regions(constraint: Any, noun: str, where: str) -> list[ObjectShape]:
         raise SceneError(
             f"{where}: {noun} must be of primitives, got meshes: give boxes"
         )
+    primitives = part(region, "primitives", list, where)
+    poses = part(region, "primitive_poses", list, where)
+    if len(primitives) != len(poses):
+        raise SceneError(
+            f"{where}: {noun} must have one pose for each of its primitives, got"
+            f" {len(primitives)} primitives and {len(poses)} poses"
+        )
     shapes = []
-    for primitive, pose in _with_poses(region, "primitive", f"{where}: {noun}"):
+    for primitive, pose in zip(primitives, poses, strict=True):
         kind = primitive_kind(primitive)
         if kind not in REGIONS:
             raise SceneError(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 import logging
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +20,7 @@ from cnpgen.addons.scene_files.robometrics_scenes import (
     is_robometrics,
     read_robometrics,
 )
-from cnpgen.arrays import AnyPath, JsonObject
+from cnpgen.arrays import AnyPath, JsonObject, NamedNumbers
 from cnpgen.errors import UsageError, listed
 from cnpgen.problems.scenes.scene_problem import (
     MAX_SCENES,
@@ -52,7 +52,7 @@ def load_scenes(
     n: int | None = None,
     allow_unused: Sequence[str] = (),
     packages: Sequence[AnyPath] = (),
-    present: Mapping[str, float] | None = None,
+    present: NamedNumbers | None = None,
     allowed_elsewhere: Sequence[str] = (),
 ) -> list[SceneProblem]:
     """Read the planning problems of scene files.
@@ -127,7 +127,7 @@ def _check_packages(packages: Sequence[AnyPath]) -> None:
 
 
 def _warn_of_unneeded_start(
-    scenes: Sequence[SceneProblem], present: Mapping[str, float]
+    scenes: Sequence[SceneProblem], present: NamedNumbers
 ) -> None:
     """Warn of a present state at which no scene starts."""
     names = tuple(present)

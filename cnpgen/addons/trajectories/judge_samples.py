@@ -130,7 +130,8 @@ def judge_samples(
             Decision.UNDECIDED, NO_JITTER_BOUND, duration=trajectory.duration
         )
     # A controller connects positions that are so close by lines.
-    if exact and _is_dense(trajectory):
+    is_dense = np.diff(trajectory.t).max() <= MAX_LINEAR_SPAN_S
+    if exact and is_dense and trajectory.dq is None:
         line = interpolated(trajectory, "linear", noise)
         smooth = through_positions(trajectory, SMOOTH_NEIGHBORS)
         found = judge(line, trajectory, scene=scene, smooth=smooth)
@@ -169,11 +170,6 @@ def acceleration_limits(
     return AccelerationLimits(
         np.maximum(smallest["ddq"], 0.0), np.maximum(smallest["jerk"], 0.0)
     )
-
-
-def _is_dense(trajectory: Trajectory) -> bool:
-    """Return whether positions without derivatives are close enough to be connected by lines."""
-    return trajectory.dq is None and np.diff(trajectory.t).max() <= MAX_LINEAR_SPAN_S
 
 
 def _curves(

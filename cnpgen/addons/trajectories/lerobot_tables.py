@@ -63,12 +63,14 @@ def read_lerobot(folder: Path) -> Iterator[TrajectoryTable]:
     widths = {"timestamp": 1, "episode_index": 1, key: len(names)}
     if parameters or scene:
         widths[LEROBOT_ENVIRONMENT] = len(places)
-    unread = [
+    used = {key, *_INDICES, LEROBOT_ENVIRONMENT}
+    unused = [name for name in features if name not in used]
+    unused += [
         f"{LEROBOT_ENVIRONMENT} {name}"
         for k, name in enumerate(places)
         if name not in parameters and k not in scene
     ]
-    unused = [*_unread_features(info, key), *unread, *_unknown(info, widths, folder)]
+    unused += _unknown(info, widths, folder)
     count = 0
     for of_file, episode, read in episodes_of(folder, widths):
         known = {*features, *_INDICES, *unused}
@@ -86,9 +88,8 @@ def read_lerobot(folder: Path) -> Iterator[TrajectoryTable]:
         columns[MESSAGE_TIME] = _frame_times(place, t, info.get("fps"))
         yield TrajectoryTable(place, columns, unused=tuple(unused))
     if (stated := info.get("total_frames", count)) != count:
-        raise UsageError(
-            f"{folder} has {count:,} frames, info.json states {stated!r:.60}"
-        )
+        text = f"{folder} has {count:,} frames, info.json states {stated!r:.60}"
+        raise UsageError(text)
 
 
 @contextmanager
@@ -150,12 +151,6 @@ def episodes_of(
                 episode,
                 {name: values[rows] for name, values in columns.items()},
             )
-
-
-def _unread_features(info: JsonMapping, key: str) -> list[str]:
-    """Return the features beside that of the states, indices and the environment."""
-    read = {key, *_INDICES, LEROBOT_ENVIRONMENT}
-    return [name for name in info["features"] if name not in read]
 
 
 def _unknown(info: JsonMapping, names: Iterable[str], folder: Path) -> Iterator[str]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from pathlib import Path
@@ -21,7 +21,7 @@ from cnpgen.addons.trajectories.table_units import plain
 from cnpgen.addons.trajectories.trajectory_scenes import problem_of_samples, with_scenes
 from cnpgen.addons.trajectories.trajectory_table import TrajectoryTable
 from cnpgen.addons.trajectories.trajectory_tables import read_trajectory_tables
-from cnpgen.arrays import AnyPath, Array, Names
+from cnpgen.arrays import AnyPath, Array, NamedNumbers, Names
 from cnpgen.errors import UsageError, either, nearest
 from cnpgen.plans.stated_units import SCALE_ATTRIBUTES, UNIT_ATTRIBUTES
 from cnpgen.problems.problem import Problem
@@ -71,7 +71,7 @@ def load_trajectories(
     *,
     joints: Sequence[str] | None = None,
     velocities: Sequence[str] | None = None,
-    parameters: Mapping[str, float] | None = None,
+    parameters: NamedNumbers | None = None,
     scenes: str | Path | Sequence[SceneProblem] | None = None,
     options: LoadOptions | None = None,
     **old_keywords: Any,
@@ -134,7 +134,7 @@ def _read(
     record: ProblemRecord,
     options: LoadOptions,
     names: tuple[Sequence[str], Sequence[str]],
-    parameters: Mapping[str, float],
+    parameters: NamedNumbers,
 ) -> tuple[list[TableReader], tuple[Trajectory, ...]]:
     """Return the readers of the tables of a file, with the names of joints and of their velocities, and trajectories."""
     robot = open_problem(record)[1]
@@ -307,7 +307,7 @@ def _of_stack(table: TrajectoryTable, index: int, count: int) -> TrajectoryTable
     )
 
 
-def _check_parameters(record: ProblemRecord, parameters: Mapping[str, float]) -> None:
+def _check_parameters(record: ProblemRecord, parameters: NamedNumbers) -> None:
     """Check the names of stated parameters."""
     known = record.parameters.names
     for name in parameters:

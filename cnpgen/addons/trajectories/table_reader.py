@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -29,7 +29,7 @@ from cnpgen.addons.trajectories.trajectory_table import (
     MAX_RATE_DEVIATION,
     TrajectoryTable,
 )
-from cnpgen.arrays import Array
+from cnpgen.arrays import Array, NamedNumbers
 from cnpgen.errors import UsageError, listed, nearest
 from cnpgen.plans.format import PHASE_COLUMN
 from cnpgen.problems.problem_record import ProblemRecord
@@ -56,7 +56,7 @@ class TableReader:
     options: LoadOptions
     joints: Sequence[str]
     velocities: Sequence[str]
-    parameters: Mapping[str, float]
+    parameters: NamedNumbers
     velocity_limit: Array
     used: set[str] = field(default_factory=set)
     notes: list[str] = field(default_factory=list)

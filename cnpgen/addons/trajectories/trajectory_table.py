@@ -8,7 +8,7 @@ from typing import Any
 
 from numpy.typing import NDArray
 
-from cnpgen.arrays import Names
+from cnpgen.arrays import NamedNumbers, Names
 
 Values = NDArray[Any]
 
@@ -40,4 +40,4 @@ class TrajectoryTable:
     lines: tuple[int, ...] = ()
     has_head: bool = True
     unused: Names = ()
-    held_joints: Mapping[str, float] = field(default_factory=dict)
+    held_joints: NamedNumbers = field(default_factory=dict)

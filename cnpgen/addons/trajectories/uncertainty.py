@@ -173,7 +173,8 @@ def _changes(  # noqa: PLR0917 - as of uncertainty_of
         offsets = [bound * random.choice([-1.0, 1.0], bound.shape) for bound in bounds]
         # Effects of several values may exceed the sum of single ones where they
         # interact.
-        _raise_to(total, changes(offsets))
+        for row, change in zip(total, changes(offsets), strict=True):
+            np.maximum(row, change, out=row)
     return [
         CURVATURE_FACTOR * np.where(np.isfinite(row), row, UNDEFINED) for row in total
     ]
@@ -223,9 +224,3 @@ def _add_scene_changes(
     if changes:
         for row, *of_scenes in zip(total, *changes, strict=True):
             np.add(row, SCENE_FACTOR * np.max(of_scenes, axis=0), out=row)
-
-
-def _raise_to(total: Sequence[Array], changes: Sequence[Array]) -> None:
-    """Replace totals by the changes that exceed them."""
-    for row, change in zip(total, changes, strict=True):
-        np.maximum(row, change, out=row)
