@@ -449,7 +449,9 @@ class Problem:
         )
         if spec.srdf:
             srdf = self.path.parent / spec.srdf
-            text = with_disabled_pairs(text, srdf, allow_unused=spec.allow_unused)
+            text = with_disabled_pairs(
+                text, srdf, planned=spec.joints, allow_unused=spec.allow_unused
+            )
         return self._with_payload(text)
 
     def _with_payload(self, text: str) -> str:

@@ -204,9 +204,15 @@ def _turn(axis: np.ndarray, angle: float) -> np.ndarray:
 
 
 def with_disabled_pairs(
-    urdf: str, srdf: Path, *, allow_unused: Collection[str] = ()
+    urdf: str,
+    srdf: Path,
+    *,
+    planned: Collection[str] = (),
+    allow_unused: Collection[str] = (),
 ) -> str:
     """Return a URDF with the disabled link pairs of an SRDF file, in which some names may be left unused.
+
+    No planned joint may be passive.
 
     URDF parsers ignore unknown elements. Pairs with links that the URDF lacks, such as
     those of another gripper, are left out with a warning that lists the links.
@@ -220,6 +226,10 @@ def with_disabled_pairs(
             [f"{srdf}: is a URDF, expected an SRDF with <{_TAG}> elements"]
         )
     _account_srdf(tree, srdf, allow_unused)
+    passive = {each.get("name", "") for each in tree.iter("passive_joint")}
+    if moved := sorted(passive.intersection(planned)):
+        text = f"<passive_joint> names the planned joint {moved[0]!r}"
+        raise RecipeError([f"{srdf}: {text}: no motor moves it, remove one of both"])
     entries = [dict(entry.attrib) for entry in tree.iter(_TAG)]
     links = {link.get("name", "") for link in urdf_tree(urdf).iter("link")}
     named = {entry[key] for entry in entries for key in _PAIR if key in entry}

@@ -54,6 +54,7 @@ class ArmJoint:
     # Limits that the URDF does not have: "position", "velocity", "torque".
     missing: Names
     replaced: Names = ()  # limits of the same names that another file states
+    jerk: float = math.inf  # limit of a URDF 1.2 [rad/s^3 or m/s^3]
 
 
 @dataclass(frozen=True)
@@ -327,4 +328,5 @@ def _joint(joint: UrdfJoint) -> ArmJoint:
         velocity=DEFAULT_SPEED if missing["velocity"] else velocity,
         effort=effort,
         missing=tuple(name for name, is_missing in missing.items() if is_missing),
+        jerk=joint.rates.get("jerk", math.inf),
     )

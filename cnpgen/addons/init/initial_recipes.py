@@ -105,7 +105,7 @@ def problem_of(
         problem.limits, torque_scale=scale, **_replaced_limits(arm, joint_limits, robot)
     )
     problem = replace(problem, limits=limits)
-    problem = _with_jerk_limits(problem, robot, joint_limits)
+    problem = _with_jerk_limits(problem, robot, arm, joint_limits)
     sources = stated_sources(arm, problem.limits, joint_limits)
     problem = replace(problem, limits=replace(problem.limits, sources=sources))
     problem, torque_notes = _with_torque(problem, robot)
@@ -281,11 +281,14 @@ def _with_torque_limits(arm: Arm, robot: Robot) -> tuple[Arm, float, list[str]]:
 
 
 def _with_jerk_limits(
-    problem: Problem, robot: Robot, joint_limits: StatedJointLimits | None
+    problem: Problem,
+    robot: Robot,
+    arm: Arm,
+    joint_limits: StatedJointLimits | None,
 ) -> Problem:
-    """Return the problem with jerk limits in proportion to the acceleration limits, or those of a file.
+    """Return the problem with jerk limits of a file, or in proportion to the accelerations.
 
-    URDFs have none.
+    The latter are at most those of a URDF 1.2.
     """
     stated = {} if joint_limits is None else joint_limits.of("max_jerk")
     accelerations = problem.limits.acceleration
@@ -295,8 +298,10 @@ def _with_jerk_limits(
         else accelerations.values
     )
     jerks = tuple(
-        stated.get(name, float(f"{INITIAL_JERK_RATE * limit:.3g}"))
-        for name, limit in zip(robot.joint_names, limits_of, strict=True)
+        stated.get(
+            joint.name, min(float(f"{INITIAL_JERK_RATE * limit:.3g}"), joint.jerk)
+        )
+        for joint, limit in zip(arm.planned, limits_of, strict=True)
     )
     limits = replace(problem.limits, jerk=PerJoint(jerks))
     *others, acceleration = problem.constraint[:3]

@@ -52,8 +52,11 @@ def read_hdf5_tables(path: Path, _: LoadOptions) -> Iterator[TrajectoryTable]:
         columns = file.columns(without=(JOINT_NAMES,))
         holders = [file.attributes, *(each.attributes for each in columns.values())]
         stated = [each.texts(JOINT_NAMES) for each in holders if JOINT_NAMES in each]
+        unused = [*(set(file.names()) - set(file))]
         if JOINT_NAMES in file.names():
             stated.append(file.texts(JOINT_NAMES))
+            of_names = file.attributes_of(JOINT_NAMES)
+            unused += [f"attribute {name} of {JOINT_NAMES}" for name in of_names]
         if len(set(stated)) > 1:
             raise UsageError(
                 f"{path}: {JOINT_NAMES} differ: {', '.join(stated[0])} and {', '.join(stated[-1])}"
@@ -61,7 +64,6 @@ def read_hdf5_tables(path: Path, _: LoadOptions) -> Iterator[TrajectoryTable]:
         names = stated[0] if stated else ()
         arrays = {name: column.read() for name, column in columns.items()}
         units = dict[str, str]()
-        unused = [*(set(file.names()) - set(file))]
         unused += [f"attribute {name}" for name in file.attributes]
         for name, column in columns.items():
             for attribute in column.attributes:

@@ -48,6 +48,7 @@ from cnpgen.addons.trajectories.trajectory_verdict import (
     TrajectoryVerdict,
 )
 from cnpgen.addons.trajectories.velocity_by_position import VelocityByPosition
+from cnpgen.addons.trajectories.window_program import TorqueBounds
 from cnpgen.addons.trajectories.witness import witness
 from cnpgen.arrays import Array
 from cnpgen.judges.plans.bernstein import find_maximum
@@ -111,7 +112,7 @@ def judge_samples(
     moved = with_jitter(errors, limits, trajectory)
     exact = is_negligible(moved, trajectory, ends.acceleration)
     detail = ""
-    tries = _curves(trajectory, errors, limits, ends, exact=exact)
+    tries = _curves(judge, trajectory, errors, ends, exact=exact)
     for curve, step in tries:
         excess = _joint_limit_excess(curve, limits)
         if excess is None:
@@ -172,9 +173,9 @@ def acceleration_limits(
 
 
 def _curves(
+    judge: FamilyJudge,
     trajectory: Trajectory,
     errors: SampleErrors,
-    limits: ProvenJointLimits,
     ends: AccelerationLimits,
     *,
     exact: bool,
@@ -191,9 +192,23 @@ def _curves(
         return
     yield curve, MAX_STEP_S
     for share in WITNESS_SHARES:
+        limits = judge.limits(trajectory.parameters)
         limit = acceleration_limits(limits, share).acceleration
-        if (curve := limited_witness(trajectory, errors, limit)) is not None:
+        torques = _torque_bounds(judge, trajectory, share)
+        curve = limited_witness(trajectory, errors, limit, torques)
+        if curve is not None:
             yield curve, MAX_STEP_S
+
+
+def _torque_bounds(
+    judge: FamilyJudge, trajectory: Trajectory, tolerance_share: float
+) -> TorqueBounds | None:
+    """Return the torque limits with most of their tolerances, or None without any."""
+    allowed = judge.torque_limit()
+    if allowed is None:
+        return None
+    limit = allowed.limit + tolerance_share * allowed.tolerance
+    return TorqueBounds(partial(judge.torques, parameters=trajectory.parameters), limit)
 
 
 def _joint_limit_excess(curve: CurveFamily, limits: ProvenJointLimits) -> str | None:

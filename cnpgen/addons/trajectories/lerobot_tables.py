@@ -85,7 +85,7 @@ def read_lerobot(folder: Path) -> Iterator[TrajectoryTable]:
         if scene:
             columns[OBSTACLE_POSES] = read[LEROBOT_ENVIRONMENT][:, scene]
         place = f"{folder}: episode {episode:g}"
-        _check_rate(place, t, info.get("fps"))
+        columns[MESSAGE_TIME] = _frame_times(place, t, info.get("fps"))
         yield TrajectoryTable(place, columns, unused=tuple(unused))
     if (stated := info.get("total_frames", count)) != count:
         text = f"{folder} has {count:,} frames, info.json states {stated!r:.60}"
@@ -176,14 +176,25 @@ def _unknown_keys(
     return [f"attribute {key} of {of}" for key in unknown]
 
 
-def _check_rate(place: str, t: Values, rate: Any) -> None:
-    """Check that times agree with the frames per second that a dataset states."""
+def _frame_times(place: str, t: Values, rate: Any) -> Values:
+    """Return times without their rounding to float32, if they are multiples of the period of the frames.
+
+    Between 1 and 2 s, the rounding is up to 6e-8 s, which at 1 rad/s is as much as the
+    rounding of the positions.
+
+    Raises:
+        UsageError: The times do not agree with the frames per second that a dataset
+            states.
+    """
     if not isinstance(rate, int | float) or not rate > 0:
         raise UsageError(f"{place}: fps must be above 0, got {rate!r:.60}")
     steps = np.diff(t)
     if len(steps) and abs(float(np.median(steps)) * rate - 1) > MAX_RATE_DEVIATION:
         step = float(np.median(steps))
         raise UsageError(f"{place} has steps of {step:.3g} s, and its fps is {rate:g}")
+    frames = np.round(t * rate) / rate
+    rounding = np.spacing(np.abs(t).astype(np.float32))
+    return frames if (np.abs(frames - t) <= rounding).all() else t
 
 
 def feature_names(feature: Any, unnamed: str = "q{}") -> list[str]:

@@ -244,6 +244,10 @@ class Hdf5:
         _check_texts(self.path, name, dataset)
         return _as_texts(Dataset(dataset)[()])
 
+    def attributes_of(self, name: str) -> Attributes:
+        """Return the attributes of a dataset, also of one of texts."""
+        return Attributes(self.path, self._open(name))
+
     def _open(self, name: str) -> Any:
         """Open an object of the file."""
         from h5py import h5l, h5o
