@@ -2,8 +2,8 @@
 
     python -m tests.kernels.make_shipped_tapes
 
-All tapes are built, whatever is stored. The robots of example-robot-data must be installed. Kernels of
-training, which takes minutes anyway, are left out: they are half of all instructions.
+All tapes are built, whatever is stored. The robots of example-robot-data must be installed. Kernels of training
+are included for the tasks of the paper only: those of all datasets are half of all instructions.
 """
 
 import json
@@ -21,6 +21,7 @@ from cnpgen.kernels import library, shipped_tapes
 from cnpgen.kernels.interpreted_kernel import InterpretedGridKernel, InterpretedKernel
 from cnpgen.kernels.library import KernelLibrary
 from cnpgen.kernels.tape import Tape
+from cnpgen.make.make_dataset import make_dataset
 from cnpgen.make.recipe import load_dataset_recipe
 from cnpgen.pipelines.prepared import PreparedPipeline
 from cnpgen.planner.planner import Planner
@@ -30,8 +31,10 @@ from cnpgen.problems.problem_file import load_problem
 from cnpgen.refine.refiner import Refiner
 from cnpgen.robots.shape import shape
 from cnpgen.schema.catalogue import list_recipes
+from cnpgen.training.train import train_model
 
 ROOT = Path(__file__).parents[2]
+TRAINED = ("airhockey-hit", "airhockey-replan", "airhockey-online", "heavy-object", "heavy-object-anywhere")  # fmt: skip
 
 
 @contextmanager
@@ -66,11 +69,20 @@ def load_kernels(name: str) -> None:
         Planner(name)
 
 
+def load_training_kernels(name: str) -> None:
+    """Load the kernels of a planner's training by one step on a few rows."""
+    with tempfile.TemporaryDirectory() as folder:
+        made = make_dataset(name, Path(folder, "rows"), n=60, workers=1)
+        train_model(made.folder, Path(folder, "model.h5"), steps=1)
+
+
 def load_all() -> None:
     """Load all kernels of shipped datasets, and those of the solver for scenes of a Panda."""
     for path in sorted((ROOT / "datasets").glob("*.toml")):
         load_kernels(path.stem)
         print(path.stem, flush=True)
+    for name in TRAINED:
+        load_training_kernels(name)
     # They do not depend on the number of obstacles.
     scenes = with_capacity(load_problem("panda"), {"box": 1})
     Refiner(scenes, load_robot(scenes))

@@ -29,6 +29,7 @@ def test_stored_tapes_are_those_of_the_sources(name: str) -> None:
     """The archive has all tapes of a dataset, with the bytes of those that its builders make."""
     with make_shipped_tapes.recorded() as tapes:
         make_shipped_tapes.load_kernels(name)
+        make_shipped_tapes.load_training_kernels(name)
     assert len(tapes) > 10
     with ZipFile(shipped_tapes.FOLDER / shipped_tapes.ARCHIVE) as archive:
         missing = set(make_shipped_tapes.names_of(tapes).values()).difference(
