@@ -13,13 +13,14 @@ from typing import Any
 import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
+from numpy_transcription import Linearization, evaluate, residual_gradients
 
 from cnpgen.refine.grid_levels import GridLevel
 from cnpgen.refine.refiner import Refiner
 from cnpgen.refine.solver.bounds import Bounds
 from cnpgen.refine.solver.hulls import Hulls
 from cnpgen.refine.solver.sqp import Result, Settings
-from cnpgen.refine.solver.transcription import Linearization, Transcription
+from cnpgen.refine.solver.transcription import Transcription
 from cnpgen.refine.task import RefinementTask
 
 Array = NDArray[np.float64]
@@ -85,7 +86,7 @@ def minimize_with_ipopt(
     )
     limit, steps, end = ITERATION_FACTOR * settings.max_iterations, 0, x
     for number in range(MAX_RUNS):
-        at = motion.evaluate(end)
+        at = evaluate(motion, end)
         violation = bounds.max_violation(at.g)
         best.offer(end, at.cost, violation)
         if steps >= limit or (number > 1 and violation < settings.violation_tolerance):
@@ -262,7 +263,7 @@ class Program:
     def at(self, x: Array) -> Linearization:
         """Evaluate at x, or return the last evaluation."""
         if self._last is None or not np.array_equal(self._last.x, x):
-            self._last = self.motion.evaluate(x)
+            self._last = evaluate(self.motion, x)
         return self._last
 
     def violation(self, x: Array) -> float:
@@ -385,7 +386,7 @@ class Program:
         return self._functions[-1]
 
     def _jacobian(self, x: Array) -> Array:
-        rows = self.motion.rows(self.at(x), self._k, self._residual)
+        rows = residual_gradients(self.motion, self.at(x), self._k, self._residual)
         return np.asarray(rows[self._row, self._column])
 
     def _pattern(self, x: Array) -> tuple[Indices, Indices]:
@@ -396,7 +397,7 @@ class Program:
         close = x + 0.01 * np.sin(np.arange(len(x)))
         depends = np.logical_or.reduce(
             [
-                (self.motion.evaluate(variables).jacobian != 0).any(axis=2)
+                (evaluate(self.motion, variables).jacobian != 0).any(axis=2)
                 for variables in (x, close)
             ]
         )
@@ -404,7 +405,9 @@ class Program:
             1, 2, (*depends.shape, len(self._bounds.lower))
         )
         generic = replace(self.at(x), jacobian=depends[..., None] * random)
-        row, column = np.nonzero(self.motion.rows(generic, self._k, self._residual))
+        row, column = np.nonzero(
+            residual_gradients(self.motion, generic, self._k, self._residual)
+        )
         order = np.lexsort((row, column))
         return row[order], column[order]
 
@@ -431,7 +434,8 @@ def lagrangian_hessian(
     width = len(at.jacobian)
     projected = node_hessians(motion, at, multipliers[points].T, points)
     unit = np.broadcast_to(np.eye(width)[:, :, None], (width, width, len(at.g)))
-    gradients = motion.rows(
+    gradients = residual_gradients(
+        motion,
         replace(at, jacobian=unit),
         np.repeat(points, width),
         np.tile(np.arange(width), len(points)),
@@ -476,7 +480,9 @@ def rate_hessian(
 
     def gradient(rate: Array) -> Array:
         return np.asarray(
-            motion.rows(replace(weighted, rate=rate), points, only).sum(axis=0)
+            residual_gradients(motion, replace(weighted, rate=rate), points, only).sum(
+                axis=0
+            )
         )
 
     size, split = len(at.rate), motion.split

@@ -5,10 +5,11 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from numpy_transcription import Linearization, evaluate, residual_gradients
 
 from cnpgen.refine.refiner import Refiner
 from cnpgen.refine.solver.bounds import Bounds
-from cnpgen.refine.solver.transcription import Linearization, Transcription
+from cnpgen.refine.solver.transcription import Transcription
 from cnpgen.refine.task import RefinementTask
 
 Array = NDArray[np.float64]
@@ -48,7 +49,7 @@ class Function:
         if time.process_time() > self.until:
             raise OutOfTimeError
         if self.at is None or not np.array_equal(self.at.x, x):
-            self.at = self.motion.evaluate(x.copy())
+            self.at = evaluate(self.motion, x.copy())
         return self.at
 
     def margins(self, x: Array) -> Array:
@@ -62,7 +63,10 @@ class Function:
         """Return the Jacobian of the margins, shape (m, nx)."""
         at = self.evaluate(x)
         return np.vstack(
-            [-self.motion.rows(at, *self.above), self.motion.rows(at, *self.below)]
+            [
+                -residual_gradients(self.motion, at, *self.above),
+                residual_gradients(self.motion, at, *self.below),
+            ]
         )
 
 

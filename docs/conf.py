@@ -15,7 +15,10 @@ import sys
 from importlib.util import find_spec
 from pathlib import Path
 
+from docutils import nodes
+from numpy.typing import ArrayLike
 from sphinx.application import Sphinx
+from sphinx.util.typing import stringify_annotation
 
 DOCS = Path(__file__).resolve().parent
 sys.path[:0] = [
@@ -32,7 +35,11 @@ from cnpgen.addons.manual.name_page import (  # noqa: E402
     bridge_names,
     public_objects,
 )
-from cnpgen.cli.docs_command import list_pages, page_text  # noqa: E402
+from cnpgen.cli.docs_command import (  # noqa: E402
+    list_pages,
+    page_text,
+    rendered_pages,
+)
 from cnpgen.machine.versions import DOCUMENTATION_URL, __version__  # noqa: E402
 
 project = "cnpgen"
@@ -56,8 +63,9 @@ extensions = [
     "sphinx_copybutton",
 ]
 copybutton_exclude = ".linenos, .gp"
+copybutton_selector = "div:not(.output) > div.highlight > pre"  # commands, not outputs
 source_suffix = {".md": "markdown", ".rst": "restructuredtext"}
-myst_enable_extensions = ["attrs_block"]  # a class of a table
+myst_enable_extensions = ["attrs_block"]  # classes of tables and blocks
 myst_heading_anchors = 4  # the anchors of headings are GitHub's
 smartquotes = False  # they would change --n
 highlight_language = "none"  # blocks without a language
@@ -88,12 +96,7 @@ CAPTIONS = {
     "reference": "Reference",
     "benchmarks": "Benchmarks",
 }
-MADE = (
-    "api",
-    "cli",
-    "keys",
-    "scene-elements",
-)  # pages of the reference without a file in the repository
+MADE = [page.stem for page in rendered_pages()]  # of the reference
 OTHERS = (
     "README",
     "CHANGELOG",
@@ -133,6 +136,9 @@ def add_navigation(_: Sphinx, docname: str, source: list[str]) -> None:
         source[0] += toctree(
             [f"/{name}" for name in OTHERS], ":caption: Project", ":glob:"
         )
+    source[0] = source[0].replace("<!-- output -->\n", "{.output}\n")
+    # MyST gives a link without a text the title of its page.
+    source[0] = re.sub(r"\[[\w/.-]+\.md\]\(", "[](", source[0])
     for name in MADE:  # a command in the repository, a link on the site
         command = f"`cnpgen docs {name}`"
         source[0] = source[0].replace(
@@ -152,7 +158,18 @@ def add_navigation(_: Sphinx, docname: str, source: list[str]) -> None:
         pattern = r"<!-- page: (\w+) -->\n\n(!\[[^\]]*\]\([^)]*\))"
         source[0] = re.sub(pattern, rf"\2\n\n{link}", source[0])
     if docname == "docs/reference/api":
-        source[0] += toctree(["api/*"], ":glob:")
+        source[0] = with_names(source[0]) + toctree(["api/*"], ":glob:")
+
+
+def with_names(text: str) -> str:
+    """Link the names in the tables of the public names to their pages."""
+    parts = re.split(r"(?m)^(?=## `)", text)
+    for index, part in enumerate(parts[1:], start=1):
+        module = part.partition("`")[2].partition("`")[0]
+        parts[index] = re.sub(
+            r"(?m)^\| `(\w+)` \|", rf"| [`\1`](api/{module}.\1.rst) |", part
+        )
+    return "".join(parts)
 
 
 def with_pages(text: str) -> str:
@@ -227,6 +244,20 @@ def escape_bars(
         )
 
 
+def name_array_like(_: Sphinx, *described: str | None) -> tuple[str | None, str | None]:
+    """Write ArrayLike in place of the union that it stands for."""
+    *_, signature, result = described
+    union = stringify_annotation(ArrayLike, "smart")
+    return signature and signature.replace(union, "~numpy.typing.ArrayLike"), result
+
+
+def write_dashes(_: Sphinx, doctree: nodes.document, docname: str) -> None:  # noqa: ARG001
+    """Write a dash between a parameter and its description."""
+    for text in list(doctree.findall(nodes.Text)):
+        if text == " -- ":
+            text.parent.replace(text, nodes.Text(" \N{EN DASH} "))
+
+
 def write_downloads(app: Sphinx, error: Exception | None) -> None:
     """Write the notebooks and the interactive pages into a site that was built."""
     if error is None and app.builder.name == "html":
@@ -243,3 +274,5 @@ def setup(app: Sphinx) -> None:
     app.connect("builder-inited", write_api_pages)
     app.connect("build-finished", write_downloads)
     app.connect("autodoc-process-docstring", escape_bars)
+    app.connect("autodoc-process-signature", name_array_like)
+    app.connect("doctree-resolved", write_dashes)

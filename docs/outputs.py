@@ -2,11 +2,13 @@
 
     python docs/outputs.py docs/tutorials/hit-a-puck.md ...
 
-An output block follows ``<!-- output -->``. It shows some lines of the output, and ``...`` for those left out. An
-empty one is filled with the whole output. A picture of a page is replaced if a block writes a file of its name.
-``tests/docs/test_blocks.py`` compares the pictures, and the lines without their numbers, which depend on the machine.
+An output block follows ``<!-- output -->``. It shows some lines of what a terminal shows, results and notes, and ``...``
+for those left out. An empty one is filled with all lines. A picture of a page is replaced if a block writes a file of
+its name. ``tests/docs/test_blocks.py`` compares the pictures, and the lines without their numbers, which depend on the
+machine.
 """
 
+import os
 import re
 import subprocess
 import sys
@@ -15,6 +17,7 @@ from pathlib import Path
 
 BLOCK = re.compile(r"((?:<!-- [^\n]* -->\n)*)```(\w*)\n(.*?)```", re.S)
 LEFT_OUT = "..."
+TERMINAL = {"PYTHONUNBUFFERED": "1"}  # results and notes in the order of a terminal
 # A dash stands for a number that a row of a table lacks.
 NUMBER = re.compile(r"[-+]?\d[\d.,]*(?:e[-+]?\d+)?|(?<= )-(?= )")
 
@@ -66,7 +69,13 @@ def write_outputs(page: Path, folder: Path) -> None:
                 "python": [sys.executable, "-c", text],
             }[language]
             printed = subprocess.run(
-                command, cwd=folder, stdout=subprocess.PIPE, text=True, check=True
+                command,
+                cwd=folder,
+                env=os.environ | TERMINAL,
+                stdout=subprocess.PIPE,
+                stderr=subprocess.STDOUT,
+                text=True,
+                check=True,
             ).stdout
         return block[0]
 

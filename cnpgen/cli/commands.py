@@ -70,8 +70,9 @@ def load_command(name: str) -> ModuleType:
     except Exception as error:
         # Modules of packages may raise any exception.
         text = f"{type(error).__name__}: {error}"
-        message = f"the command {name!r} cannot be imported: {text}"
-        raise MachineError(message) from error
+        raise MachineError(
+            f"the command {name!r} cannot be imported: {text}"
+        ) from error
     return module
 
 

@@ -33,8 +33,12 @@ MAX_LISTED_TASKS = 10  # tasks without an answer that are listed by number
 
 def add_options(parser: Parser) -> None:
     option = parser.add_argument
-    text = "a pipeline, dataset or problem by name, or a recipe file"
-    option("pipeline", metavar="NAME|FILE", type=recipe_names.tasks_of, help=text)
+    option(
+        "pipeline",
+        metavar="NAME|FILE",
+        type=recipe_names.tasks_of,
+        help="a pipeline, dataset or problem by name, or a recipe file",
+    )
     option(
         "tasks",
         metavar="TASKS",

@@ -27,8 +27,12 @@ _NEXT = {
 
 
 def add_options(parser: Parser) -> None:
-    text = "a shipped dataset, pipeline or problem (see 'cnpgen list')"
-    parser.add_argument("recipe", metavar="NAME", type=recipe_names.shipped, help=text)
+    parser.add_argument(
+        "recipe",
+        metavar="NAME",
+        type=recipe_names.shipped,
+        help="a shipped dataset, pipeline or problem (see 'cnpgen list')",
+    )
     parser.add_argument(
         "folder", metavar="DIR", help="folder of the copies; its name becomes theirs"
     )

@@ -62,8 +62,9 @@ def run(arguments: argparse.Namespace) -> int:
 def _print_url(page: Path) -> None:
     url = page_url(page)
     if url is None:
-        text = "the documentation has no address yet: 'cnpgen docs PAGE' prints a page"
-        raise UsageError(text)
+        raise UsageError(
+            "the documentation has no address yet: 'cnpgen docs PAGE' prints a page"
+        )
     print(url)
 
 
@@ -89,20 +90,21 @@ def list_pages() -> dict[str, Path]:
     # The table above it repeats some links.
     lists = page_text(pages["index"]).partition("## Tutorials")[2]
     for kind in KINDS:
+        made = [page for page in rendered_pages() if page.parent.name == kind]
         # Pages of benchmarks are named with their folder.
         prefix = "benchmarks/" if kind == "benchmarks" else ""
         files = sorted(
-            {*(folder / kind).glob("*.md"), *_rendered(kind, folder)},
+            {*(folder / kind).glob("*.md"), *made},
             key=lambda file: lists.find(f"{file.parent.name}/{file.name}"),
         )
         pages |= {prefix + file.stem: file for file in files}
     return pages
 
 
-def _rendered(kind: str, folder: Path) -> list[Path]:
-    """Return the paths of the pages of a kind that are made from the code; on the site only, there are such files."""
-    names = [entry.name for entry in addons.installed(PAGES) if kind == "reference"]
-    return [folder / kind / f"{name}.md" for name in names]
+def rendered_pages() -> list[Path]:
+    """Return the paths of the pages that are made from the code; only the site has such files."""
+    folder = docs_folder() / "reference"
+    return [folder / f"{entry.name}.md" for entry in addons.installed(PAGES)]
 
 
 def page_name(text: str, pages: dict[str, Path]) -> str:
@@ -147,7 +149,7 @@ def mentioned_addresses(text: str) -> list[str]:
 
 def page_text(page: Path) -> str:
     """Return the text of a page of ``list_pages``, from its file or from the code."""
-    if page not in _rendered(page.parent.name, docs_folder()):
+    if page not in rendered_pages():
         return page.read_text(encoding="utf-8")
     return rendered_page(page.stem)
 

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING
 from cnpgen.cli import recipe_names, values, verdict_text
 from cnpgen.cli.parser import EXTRAPOLATE, Parser, add_json, refuse
 from cnpgen.cli.terminal import Meter
-from cnpgen.errors import DatasetError, UsageError
+from cnpgen.errors import DatasetError, UsageError, counted
 
 if TYPE_CHECKING:
     from cnpgen.plans.evaluate import Evaluation
@@ -61,8 +61,7 @@ def add_options(parser: Parser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    if not arguments.plot:
-        refuse(arguments, ["plan"], "{} needs --plot")
+    refuse_without_effect(arguments)
     found = _evaluate(arguments)
     if arguments.json:
         _write_json(arguments.file, found)
@@ -75,6 +74,14 @@ def run(arguments: argparse.Namespace) -> int:
     return 0 if found.valid.all() else 1
 
 
+def refuse_without_effect(arguments: argparse.Namespace) -> None:
+    """Refuse options that have no effect on the output."""
+    if not arguments.plot:
+        refuse(arguments, ["plan"], "{} needs --plot")
+    if arguments.json:
+        refuse(arguments, ["list"], "{} has no effect with --json, which has all")
+
+
 def _evaluate(arguments: argparse.Namespace) -> "Evaluation":
     from cnpgen.plans.evaluate import evaluate_plans
 
@@ -83,7 +90,7 @@ def _evaluate(arguments: argparse.Namespace) -> "Evaluation":
     )
     if arguments.plan is not None and arguments.plan >= len(plans):
         raise UsageError(
-            f"{arguments.file} has no plan {arguments.plan}: {len(plans)} plans are numbered from 0"
+            f"{arguments.file} has no plan {arguments.plan}: {counted(len(plans), 'plan')}, numbered from 0"
         )
     # Without a terminal the summary alone is printed.
     with Meter(quiet=arguments.quiet or not sys.stderr.isatty(), noun="plan") as meter:

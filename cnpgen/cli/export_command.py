@@ -91,9 +91,11 @@ def export(
     if not exporter.samples:
         refuse(arguments, ["rate"], f"{{}} has no effect with --to {arguments.to}")
     rate = DEFAULT_RATE_HZ if arguments.rate is None else arguments.rate
-    chosen, out = _chosen(plans, arguments), _place(arguments, exporter)
+    chosen = _chosen(plans, arguments)
+    out = _place(arguments, exporter)
     target = _target(out, exporter)
-    force, to = arguments.force, arguments.to
+    to = arguments.to
+    force = arguments.force
     # The result depends on the contents of all files that are read, not on their names.
     files = Path(arguments.file), *(arguments.join or ()), *sources
     request = [to, rate, chosen, arguments.at, [content_sha256(file) for file in files]]
@@ -102,7 +104,6 @@ def export(
         print(target)
         return 0
     exported = export_plans(plans, out, to=to, rate=rate, only=chosen, force=force)
-    _report(exported)
     lacks_scene = not exporter.uses_environment
     if lacks_scene and open_problem(plans.problem)[0].has_sample_obstacles:
         print(f"cnpgen: note: {NO_OBSTACLES}", file=sys.stderr)
@@ -110,21 +111,23 @@ def export(
     refused = len(exported.refused)
     if not refused:
         record_request(target, request)
-    of_all = f" of {exported.count + refused:,}" if refused else ""
-    at = f" at {rate:g} Hz" if exporter.samples else ""
-    print(f"exported {counted(exported.count, 'plan')}{of_all}{at}", file=sys.stderr)
+    _report(exported, f" at {rate:g} Hz" if exporter.samples else "")
     print(exported.files[0] if exporter.single_file else out)
     return 1 if refused else 0
 
 
-def _report(exported: "Exported") -> None:
-    """Report plans that were left out, and exported ones that are not valid."""
+def _report(exported: "Exported", at_rate: str) -> None:
+    """Report plans that were left out, exported ones that are not valid, and the number of all."""
     for why in exported.refused.values():
         print(f"cnpgen: left out: {why}", file=sys.stderr)
     if exported.invalid:
         which = f"plan{'s' * (len(exported.invalid) > 1)} {listed(exported.invalid, MAX_LISTED_PLANS)}"
         text = f"not valid by their status ('cnpgen evaluate' reports why): {which}"
         print(f"cnpgen: warning: {text}", file=sys.stderr)
+    refused = len(exported.refused)
+    of_all = f" of {exported.count + refused:,}" if refused else ""
+    count = counted(exported.count, "plan")
+    print(f"exported {count}{of_all}{at_rate}", file=sys.stderr)
 
 
 def _plans(arguments: argparse.Namespace) -> "Plans | JoinedPlans":
@@ -178,7 +181,7 @@ def _chosen(
     chosen = set(arguments.plan or ())
     if chosen and max(chosen) >= len(plans):
         raise UsageError(
-            f"there is no plan {max(chosen)}: {len(plans)} plans are numbered from 0"
+            f"there is no plan {max(chosen)}: {counted(len(plans), 'plan')}, numbered from 0"
         )
     if arguments.sample is not None:
         missing = np.setdiff1d(arguments.sample, plans.sample_id)

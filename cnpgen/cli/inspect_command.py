@@ -11,6 +11,7 @@ import argparse
 import sys
 from typing import TYPE_CHECKING
 
+from cnpgen.arrays import TextRows
 from cnpgen.cli import recipe_names, values
 from cnpgen.cli.parser import Parser, add_json
 from cnpgen.cli.terminal import table
@@ -134,9 +135,7 @@ def _yield_lines(sampling: "SamplingStatistics") -> list[str]:
     ]
 
 
-def _field_rows(
-    field: "Field", found: "FieldStatistics | None"
-) -> list[tuple[str, ...]]:
+def _field_rows(field: "Field", found: "FieldStatistics | None") -> TextRows:
     """Return a row per column of a field.
 
     Its name is on the first one, its unit where it is not that of the last.

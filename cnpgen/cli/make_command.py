@@ -73,8 +73,12 @@ def add_options(parser: Parser) -> None:
 def _add_generation(parser: Parser) -> None:
     """Add the options of how samples are made and stored."""
     option = parser.add_argument
-    text = "rows per file; default 8192 to 65536, with --certify 64 to 1024"
-    option("--shard-size", metavar="R", type=values.positive, help=text)
+    option(
+        "--shard-size",
+        metavar="R",
+        type=values.positive,
+        help="rows per file; default 8192 to 65536, with --certify 64 to 1024",
+    )
     option(
         "--dtype",
         choices=("float64", "float32"),
@@ -97,10 +101,12 @@ def _add_generation(parser: Parser) -> None:
         action="store_true",
         help="plan every sample, and store those with a valid plan",
     )
-    text = (
-        "with --certify: start from the plans of this planner, a shipped one or a file"
+    option(
+        "--model",
+        metavar="NAME|FILE",
+        type=recipe_names.model,
+        help="with --certify: start from the plans of this planner, a shipped one or a file",
     )
-    option("--model", metavar="NAME|FILE", type=recipe_names.model, help=text)
 
 
 def run(arguments: argparse.Namespace) -> None:

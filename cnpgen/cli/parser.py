@@ -194,10 +194,18 @@ def add_engine(
 ) -> None:
     """Add the options of ``ENGINE``, with a help for ``--workers``."""
     parser.add_argument("--workers", metavar="W", type=values.positive, help=workers)
-    text = "engine of the workers: local processes (loky, default), or a cluster: dask or ray ('cnpgen docs scale')"
-    parser.add_argument("--engine", metavar="NAME", type=values.engine, help=text)
-    text = "address of the cluster, such as tcp://host:8786; without it a local cluster is started"
-    parser.add_argument("--address", metavar="A", help=text)
+    parser.add_argument(
+        "--engine",
+        metavar="NAME",
+        type=values.engine,
+        help="engine of the workers: local processes (loky, default), or a cluster: dask or ray ('cnpgen "
+        "docs scale')",
+    )
+    parser.add_argument(
+        "--address",
+        metavar="A",
+        help="address of the cluster, such as tcp://host:8786; without it a local cluster is started",
+    )
 
 
 EXTRAPOLATE = (
@@ -234,10 +242,18 @@ def add_selection(parser: Options) -> None:
     selected = "first sample of the split (default: 0)"
     option("--split", metavar="NAME", help="split of the folder (default: validation)")
     option("--first", metavar="I", type=values.natural, help=selected)
-    text = "number of problems; for a folder by default all that follow"
-    option("--n", metavar="K", type=values.rows, help=text)
-    text = "root seed of fresh problems; default the recipe's"
-    option("--seed", metavar="S", type=values.seed, help=text)
+    option(
+        "--n",
+        metavar="K",
+        type=values.rows,
+        help="number of problems; for a folder by default all that follow",
+    )
+    option(
+        "--seed",
+        metavar="S",
+        type=values.seed,
+        help="root seed of fresh problems; default the recipe's",
+    )
 
 
 def add_json(parser: Parser) -> None:

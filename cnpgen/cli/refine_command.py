@@ -12,8 +12,9 @@ import sys
 import textwrap
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
+from cnpgen.arrays import JsonObject
 from cnpgen.cli import recipe_names, values
 from cnpgen.cli.interruption import resumable
 from cnpgen.cli.parser import (
@@ -69,11 +70,18 @@ in either case. If OUT is there already as the result of the same request, the c
 
 def add_options(parser: Parser) -> None:
     parser.add_argument("file", metavar="FILE", type=Path, help="plan file, .h5")
-    text = "output file (default: FILE-refined.h5 beside it)"
-    parser.add_argument("-o", "--out", metavar="OUT", type=Path, help=text)
-    text = "the problem of the plans; its tolerances are used"
     parser.add_argument(
-        "--problem", metavar="NAME|FILE", type=recipe_names.problem, help=text
+        "-o",
+        "--out",
+        metavar="OUT",
+        type=Path,
+        help="output file (default: FILE-refined.h5 beside it)",
+    )
+    parser.add_argument(
+        "--problem",
+        metavar="NAME|FILE",
+        type=recipe_names.problem,
+        help="the problem of the plans; its tolerances are used",
     )
     parser.add_argument("--extrapolate", action="store_true", help=EXTRAPOLATE)
     add_refine_options(parser)
@@ -123,12 +131,24 @@ def add_refining(parser: Options) -> None:
     text = "relative change of the objective at which the iteration converges (default: 1e-3; without an initial"
     text += " guess a tenth of it, among obstacles a twentieth)"
     option("--tolerance", metavar="X", type=float, help=text)
-    text = "time per plan, such as 10ms: returns the best plan until then, never worse than the input"
-    option("--deadline", metavar="S", type=values.seconds_with_unit, help=text)
-    text = "largest difference of every joint from the input path, such as 2deg (default: only the ends are kept)"
-    option("--stay-within", metavar="E", type=values.angle, help=text)
-    text = "report for every invalid plan whether its problem is proven infeasible"
-    option("--explain", action="store_true", help=text)
+    option(
+        "--deadline",
+        metavar="S",
+        type=values.seconds_with_unit,
+        help="time per plan, such as 10ms: returns the best plan until then, never worse than the input",
+    )
+    option(
+        "--stay-within",
+        metavar="E",
+        type=values.angle,
+        help="largest difference of every joint from the input path, such as 2deg (default: only the ends "
+        "are kept)",
+    )
+    option(
+        "--explain",
+        action="store_true",
+        help="report for every invalid plan whether its problem is proven infeasible",
+    )
 
 
 def refine_and_save(
@@ -189,7 +209,7 @@ def _identity(plans: "Plans", options: "RefineOptions") -> list[str]:
 
 
 def _print_result(
-    arguments: argparse.Namespace, out: Path, facts: dict[str, Any], times: "Times"
+    arguments: argparse.Namespace, out: Path, facts: JsonObject, times: "Times"
 ) -> None:
     """Print a summary on stderr, and the file or JSON on stdout."""
     if not arguments.quiet:
@@ -263,7 +283,7 @@ def check_place(out: Path) -> None:
 
 
 def _explain(
-    facts: dict[str, Any], found: "Refinement | SolvedScenes", meter: Meter
+    facts: JsonObject, found: "Refinement | SolvedScenes", meter: Meter
 ) -> None:
     """Add proofs of infeasibility to the results of invalid plans, unless all have one."""
     from cnpgen.refine.proof.explain import explain_plans
@@ -277,7 +297,7 @@ def _explain(
         meter(1)
 
 
-def _summary(facts: dict[str, Any], times: "Times", *, listed: int) -> list[str]:
+def _summary(facts: JsonObject, times: "Times", *, listed: int) -> list[str]:
     """Summarize the refined plans."""
     from cnpgen.refine.task import Outcome
 
@@ -303,7 +323,7 @@ def _summary(facts: dict[str, Any], times: "Times", *, listed: int) -> list[str]
     return lines
 
 
-def _failure_text(failure: dict[str, Any]) -> str:
+def _failure_text(failure: JsonObject) -> str:
     """Describe why one plan is invalid, with the proof of its problem if requested."""
     why = (
         f"{failure['finding']}: {failure['explanation']}"

@@ -36,6 +36,7 @@ if TYPE_CHECKING:
 
     from cnpgen.make.solve_scenes import SolvedScenes
     from cnpgen.plans import Plans
+    from cnpgen.problems.problem import Problem
     from cnpgen.problems.scenes.scene_problem import SceneProblem
 
 
@@ -107,10 +108,8 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def _solve_scenes(arguments: argparse.Namespace, out: Path) -> int:
-    import joblib
-
     from cnpgen.make.solve_scenes import SceneOptions, solve_scenes
-    from cnpgen.problems.problem_record import as_problem, record_problem
+    from cnpgen.problems.problem_record import as_problem
 
     refuse(
         arguments,
@@ -121,19 +120,10 @@ def _solve_scenes(arguments: argparse.Namespace, out: Path) -> int:
         refuse(arguments, ["stay_within"], STAY_WITHIN)
     problem = as_problem(arguments.robot)
     scenes = _scenes(arguments, problem.robot.joints)
-    record = record_problem(problem)
     initial = None
     if arguments.initial_plans is not None:
-        initial = recipe_names.read_plans(arguments.initial_plans, problem=None)
-    # What the result depends on; parts that are absent leave earlier requests equal.
-    request = [
-        # With the meshes, which other files may hold.
-        joblib.hash(scenes),
-        [record.recipe, record.urdf],
-        options_of(arguments, "payload"),
-        *([] if initial is None else [joblib.hash(vars(initial.motion))]),
-        *(["smooth stop"] if arguments.smooth_stop else []),
-    ]
+        initial = recipe_names.read_plans(arguments.initial_plans)
+    request = _request(arguments, problem, scenes, initial)
 
     def solve(_: "Plans", **options: Any) -> "SolvedScenes":
         # Some options belong to the run as a whole, the others to the solver.
@@ -151,6 +141,28 @@ def _solve_scenes(arguments: argparse.Namespace, out: Path) -> int:
     return refine_and_save(
         arguments, None, out, title=title, make=solve, request=request
     )
+
+
+def _request(
+    arguments: argparse.Namespace,
+    problem: "Problem",
+    scenes: "list[SceneProblem]",
+    initial: "Plans | None",
+) -> list[Any]:
+    """Return what the result depends on; parts that are absent leave earlier requests equal."""
+    import joblib
+
+    from cnpgen.problems.problem_record import record_problem
+
+    record = record_problem(problem)
+    return [
+        # With the meshes, which other files may hold.
+        joblib.hash(scenes),
+        [record.recipe, record.urdf],
+        options_of(arguments, "payload"),
+        *([] if initial is None else [joblib.hash(vars(initial.motion))]),
+        *(["smooth stop"] if arguments.smooth_stop else []),
+    ]
 
 
 def _scenes(

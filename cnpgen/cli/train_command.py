@@ -13,15 +13,15 @@ import argparse
 import shlex
 import sys
 import textwrap
-from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
+from cnpgen.arrays import JsonMapping
 from cnpgen.cli import recipe_names, values
 from cnpgen.cli.parser import Parser, options_of
 from cnpgen.cli.terminal import LINE_WIDTH, Meter
 from cnpgen.cli.train_options import add_settings, changed_settings, passed_settings
-from cnpgen.errors import MachineError
+from cnpgen.errors import MachineError, counted
 
 if TYPE_CHECKING:
     from cnpgen.training.checkpoint import State
@@ -85,7 +85,7 @@ class Watch:
         self._meter = Meter(quiet=quiet, noun="step")
         self._quiet = quiet
         self._last = 0
-        self._seen: Mapping[str, Any] = {}
+        self._seen: JsonMapping = {}
 
     def begin(self, state: "State", run: "Run") -> None:
         """Say what begins."""
@@ -94,7 +94,9 @@ class Watch:
         self._last = step
         parameters = run.learner.architecture.n_parameters
         self._meter.begin(
-            f"training {parameters:,} parameters on {len(run.rows):,} rows", steps, step
+            f"training {parameters:,} parameters on {counted(len(run.rows), 'row')}",
+            steps,
+            step,
         )
         wanted = run.learner.settings.batch_size
         taken = run.order.batch_size
@@ -111,7 +113,7 @@ class Watch:
                 file=sys.stderr,
             )
 
-    def __call__(self, record: Mapping[str, Any]) -> None:
+    def __call__(self, record: JsonMapping) -> None:
         """Show a line of the log."""
         step = record["step"]
         self._meter(step - self._last)
@@ -224,7 +226,7 @@ def _draw(trained: "Trained") -> None:
         print(f"cnpgen: no learning curve: {error}", file=sys.stderr)
 
 
-def _words(found: Mapping[str, Any]) -> str:
+def _words(found: JsonMapping) -> str:
     text = f"{found['valid']:.1%} of {found['plans']:,} plans valid, {found['duration_s']:.3f} s"
     if "z_error_mm_s" in found:
         text += f", z error {found['z_error_mm_s']:.3f} mm s"
@@ -238,7 +240,7 @@ def _words(found: Mapping[str, Any]) -> str:
     )
 
 
-def _terms(record: Mapping[str, Any]) -> str:
+def _terms(record: JsonMapping) -> str:
     """Say how large the terms are, as multiples of their budgets where they have one, and their weights."""
     words = []
     for name, weight in record["weights"].items():

@@ -116,8 +116,13 @@ def add_settings(parser: Parser) -> None:
         default=None,
         help="tighten only the limits that --margin names",
     )
-    text = "fraction of the steps, such as 0.1, that imitate the plans of a dataset made with --certify (default: 0)"
-    option("--imitate", metavar="X", type=_real, help=text)
+    option(
+        "--imitate",
+        metavar="X",
+        type=_real,
+        help="fraction of the steps, such as 0.1, that imitate the plans of a dataset made with --certify "
+        "(default: 0)",
+    )
 
 
 def changed_settings(

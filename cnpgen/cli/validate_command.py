@@ -35,8 +35,13 @@ def add_options(parser: Parser) -> None:
         action="store_true",
         help="check every row, its constraints with Pinocchio and Coal",
     )
-    text = "make K random blocks again from the seed and compare them"
-    option("--regenerate", metavar="K", type=values.natural, default=0, help=text)
+    option(
+        "--regenerate",
+        metavar="K",
+        type=values.natural,
+        default=0,
+        help="make K random blocks again from the seed and compare them",
+    )
     add_engine(parser, "processes for --deep; default one per available core")
     add_json(parser)
 

@@ -132,8 +132,9 @@ def seconds_with_unit(text: str) -> float:
     time = seconds(text)
     # The number ends without a letter: it has no unit.
     if text.strip()[-1:].isdigit() or text.strip().endswith("."):
-        text = f"expected a time with its unit, such as 10ms; got {text!r}, is it {text}ms or {text}s?"
-        raise ArgumentTypeError(text)
+        raise ArgumentTypeError(
+            f"expected a time with its unit, such as 10ms; got {text!r}, is it {text}ms or {text}s?"
+        )
     return time
 
 
@@ -162,20 +163,6 @@ seconds = partial(_quantity, "s", "a time above 0, such as 0.001 or 1ms")
 meters = partial(_quantity, "m", "a length above 0, such as 0.02 or 20mm")
 kilograms = partial(_quantity, "kg", "a mass above 0, such as 1.5 or 1.5kg")
 hertz = partial(_quantity, "1/s", "a rate above 0, such as 1000 or 1000Hz")
-
-
-def positions(text: str) -> tuple[float, ...]:
-    """Read finite numbers, separated by commas."""
-    try:
-        found = tuple(float(item) for item in text.split(","))
-    except ValueError:
-        # A text that is no number is refused with the numbers that are not finite.
-        found = (math.nan,)
-    if not all(map(math.isfinite, found)):
-        raise ArgumentTypeError(
-            f"expected numbers in rad or m such as 0,-0.4,1.2; got {text[:60]!r}"
-        )
-    return found
 
 
 def numbers(text: str) -> tuple[int, ...]:
@@ -218,6 +205,12 @@ def _real_numbers(
     if not found or not accepts(found):
         raise ArgumentTypeError(f"expected {expected}; got {text[:60]!r}")
     return found
+
+
+def positions(text: str) -> tuple[float, ...]:
+    """Read finite numbers, separated by commas."""
+    expected = "numbers in rad or m such as 0,-0.4,1.2"
+    return _real_numbers(text, expected, lambda found: all(map(math.isfinite, found)))
 
 
 def errors(text: str) -> float | tuple[float, ...]:

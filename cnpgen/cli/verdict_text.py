@@ -5,10 +5,11 @@ And the plans one by one.
 
 import math
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
+from cnpgen.arrays import JsonMapping, JsonObject, TextRows
 from cnpgen.cli.terminal import table
 from cnpgen.errors import counted
 
@@ -86,9 +87,9 @@ def checksum_text(plans: "Plans") -> str:
     )
 
 
-def _reasons(found: "Evaluation", summary: dict[str, Any]) -> list[tuple[str, ...]]:
+def _reasons(found: "Evaluation", summary: JsonObject) -> TextRows:
     """Say why plans are not valid, the most frequent reason first."""
-    rows: list[tuple[str, ...]] = [("not valid because", "plans", "the worst of them")]
+    rows: TextRows = [("not valid because", "plans", "the worst of them")]
     for reason, number in summary["reasons"].items():
         plans = [
             (index, verdict)
@@ -130,11 +131,11 @@ def _shown(found: "Evaluation") -> list[str]:
     ]
 
 
-def _figures(summary: dict[str, Any], names: Sequence[str]) -> list[tuple[str, ...]]:
+def _figures(summary: JsonObject, names: Sequence[str]) -> TextRows:
     """Lay out the metrics: of valid plans, of those valid by the paper's rules, and of all."""
     columns = [("metrics_of_valid", name) for name in ("mean", "median", "p95", "max")]
     columns += [("metrics_of_paper_valid", "mean"), ("metrics_of_all", "mean")]
-    rows: list[tuple[str, ...]] = [
+    rows: TextRows = [
         (
             "",
             "valid: mean",
@@ -155,7 +156,7 @@ def _figures(summary: dict[str, Any], names: Sequence[str]) -> list[tuple[str, .
     return rows
 
 
-def _margins(summary: dict[str, Any]) -> list[tuple[str, ...]]:
+def _margins(summary: JsonObject) -> TextRows:
     """Format per condition the number of violating plans and the plan with the smallest margin."""
     rows = [margin_head("condition", "violated by", item="plan")]
     for name, worst in summary["conditions"].items():
@@ -174,7 +175,7 @@ def margin_head(*first: str, item: str) -> tuple[str, ...]:
     return *first, "margin", "violation", "tolerance", "unit", item, "t [s]", "where"
 
 
-def margin_cells(margin: Mapping[str, Any], index: int) -> tuple[str, ...]:
+def margin_cells(margin: JsonMapping, index: int) -> tuple[str, ...]:
     """Format a margin, or the violation in its place, with tolerance, unit, index, time and place as cells of a table."""
     violation = margin["violation"]
     # A violation of 0 or less is a margin.

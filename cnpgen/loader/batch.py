@@ -7,12 +7,11 @@ from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from functools import partial
 from itertools import chain
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from cnpgen.errors import DatasetError
+from cnpgen.arrays import AnyArray
+from cnpgen.errors import DatasetError, counted
 from cnpgen.loader.row_format import Columns, Normalization
 from cnpgen.loader.shard_reader import problem_obstacles
 from cnpgen.problems.scenes.observe import MAX_SEED, Scenes, observe
@@ -24,7 +23,7 @@ from cnpgen.store.scene_table import OBSTACLE_POSES
 
 
 @dataclass(frozen=True, eq=False)
-class Batch(Mapping[str, NDArray[Any]]):
+class Batch(Mapping[str, AnyArray]):
     """B rows. The arrays belong to the batch alone and may be changed.
 
     ``batch["start_q"]`` has shape (B, width), or (B,) for a scalar field. Float fields
@@ -41,14 +40,14 @@ class Batch(Mapping[str, NDArray[Any]]):
             axis of length B.
     """
 
-    table: NDArray[Any]
+    table: AnyArray
     layout: Columns
-    integers: Mapping[str, NDArray[Any]]
+    integers: Mapping[str, AnyArray]
     normalization: Normalization | None = None
-    observations: Mapping[str, NDArray[Any]] = field(default_factory=dict)
+    observations: Mapping[str, AnyArray] = field(default_factory=dict)
 
     def __repr__(self) -> str:
-        return f"<batch of {self.rows} rows, {self.table.dtype}: {self.layout.summary}>"
+        return f"<batch of {counted(self.rows, 'row')}, {self.table.dtype}: {self.layout.summary}>"
 
     @property
     def columns(self) -> dict[str, slice]:
@@ -60,7 +59,7 @@ class Batch(Mapping[str, NDArray[Any]]):
         """Number of rows B."""
         return len(self.table)
 
-    def __getitem__(self, name: str) -> NDArray[Any]:
+    def __getitem__(self, name: str) -> AnyArray:
         if name in self.observations:
             return self.observations[name]
         if name in self.integers:
@@ -92,7 +91,7 @@ class BatchObserver:
     scenes: Callable[[Batch], Scenes]
     seed: int = 0
 
-    def __call__(self, batch: Batch) -> dict[str, NDArray[Any]]:
+    def __call__(self, batch: Batch) -> dict[str, AnyArray]:
         """Observe the scenes of a batch."""
         # Points depend on the content of the batch: equal batches are observed equally,
         # others differently.
@@ -105,8 +104,10 @@ def observer_of(
 ) -> BatchObserver:
     """Return the observer of the scenes of a dataset, for batches with the field ``obstacle_poses``."""
     if not spec.scene_obstacles:
-        text = f"{spec.name} has no scenes to observe: expected a dataset such as panda-scenes, or a BatchObserver"
-        raise DatasetError(text)
+        raise DatasetError(
+            f"{spec.name} has no scenes to observe: expected a dataset such as panda-scenes, or a "
+            "BatchObserver"
+        )
     return BatchObserver(kind, partial(_scenes_of, problem_obstacles(spec)), seed)
 
 

@@ -7,8 +7,8 @@ from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from cnpgen.arrays import AnyArray
 from cnpgen.errors import DatasetError, UsageError
 from cnpgen.loader.batch import Batch
 from cnpgen.loader.row_format import RowFormat
@@ -18,7 +18,7 @@ from cnpgen.schema.arguments import flag, integer
 
 LOADER_STATE_FORMAT = "cnpgen-loader-state"
 LOADER_STATE_VERSION = 1  # also raised if the computation of the order changes
-Observe = Callable[[Batch], Mapping[str, NDArray[Any]]]
+Observe = Callable[[Batch], Mapping[str, AnyArray]]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -117,8 +117,10 @@ def position_from_json(state: Mapping[str, Any], source: SplitShards) -> Positio
         )
     if state.get("format_version") != LOADER_STATE_VERSION:
         version = state.get("format_version")
-        text = f"the loader's state has format version {version!r}, this cnpgen reads {LOADER_STATE_VERSION}"
-        raise DatasetError(text)
+        raise DatasetError(
+            f"the loader's state has format version {version!r}, this cnpgen reads "
+            f"{LOADER_STATE_VERSION}"
+        )
     for name, value in (("fingerprint", source.fingerprint), ("split", source.split)):
         if state.get(name) != value:
             raise DatasetError(
@@ -296,8 +298,10 @@ class Batches:
         if epoch is not None or batch is not None:
             used = integer("batch", batch or 0, least=0)
             if used > len(self):
-                text = f"must be at most {len(self)}, the number of batches of an epoch, got {used}"
-                raise UsageError(text, argument="batch")
+                raise UsageError(
+                    f"must be at most {len(self)}, the number of batches of an epoch, got {used}",
+                    argument="batch",
+                )
             # The number of used batches determines the position on all ranks.
             row = min(used * self._partition.batch_size, self._source.rows)
             epoch = (

@@ -14,8 +14,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, DTypeLike, NDArray
+from numpy.typing import ArrayLike, DTypeLike
 
+from cnpgen.arrays import AnyArray
 from cnpgen.errors import DatasetError, MissingExtraError, UsageError, lacks
 from cnpgen.loader.batch import observer_of
 from cnpgen.loader.batch_options import BatchOptions
@@ -329,7 +330,7 @@ class Dataset:
 
 
 def make_frame(
-    rows: Mapping[str, NDArray[Any]], fields: Sequence[Field], *, library: str | None
+    rows: Mapping[str, AnyArray], fields: Sequence[Field], *, library: str | None
 ) -> Any:
     """Convert rows, of shape (rows, width) or (rows,) each, to a ``DataFrame`` with columns in the order of the fields.
 
@@ -364,6 +365,8 @@ def _installed(library: str | None) -> str:
     candidates = LIBRARIES if library is None else (library,)
     installed = next((name for name in candidates if find_spec(name) is not None), None)
     if installed is None:
-        text = f"a frame needs {' or '.join(candidates)}, not installed here: pip install 'cnpgen[{candidates[0]}]'"
-        raise MissingExtraError(text)
+        raise MissingExtraError(
+            f"a frame needs {' or '.join(candidates)}, not installed here: pip install "
+            f"'cnpgen[{candidates[0]}]'"
+        )
     return installed

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from cnpgen.errors import UsageError
+from cnpgen.errors import UsageError, counted
 from cnpgen.loader.row_format import Columns, RowFormat
 from cnpgen.loader.shard_reader import Rows, SplitShards
 from cnpgen.schema.arguments import reject_masked
@@ -64,8 +64,10 @@ def _checked(indices: ArrayLike, source: SplitShards) -> Indices:
     # As of lists, negative indices count from the end.
     wrong = (rows < -source.rows) | (rows >= source.rows)
     if wrong.any():
-        text = f"split {source.split!r} has {source.rows} rows, there is no row {rows[wrong][0]}"
-        raise RowError(text, concerns="indices")
+        raise RowError(
+            f"split {source.split!r} has {source.rows} rows, there is no row {rows[wrong][0]}",
+            concerns="indices",
+        )
     return np.where(rows < 0, rows + source.rows, rows).astype(np.int64)
 
 
@@ -104,7 +106,7 @@ class Split:
     row_format: RowFormat
 
     def __repr__(self) -> str:
-        return f"<{self.source.rows:,} rows of split {self.source.split!r}: {self.row_format.layout.summary}>"
+        return f"<{counted(self.source.rows, 'row')} of split {self.source.split!r}: {self.row_format.layout.summary}>"
 
     def __len__(self) -> int:
         return self.source.rows

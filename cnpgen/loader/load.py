@@ -119,8 +119,10 @@ def _check_rows(spec: DatasetSpec, shards: Iterable[Shard]) -> None:
         if shard.rows * width > max(
             MAX_EXPANSION * shard.size, MIN_EXPANSION_LIMIT_BYTES
         ):
-            text = f"{shard.path} has {shard.size:,} bytes, too few for the {shard.rows:,} rows of {SPECIFICATION}"
-            raise DatasetError(text)
+            raise DatasetError(
+                f"{shard.path} has {shard.size:,} bytes, too few for the {shard.rows:,} rows of "
+                f"{SPECIFICATION}"
+            )
 
 
 def _present(
@@ -138,8 +140,10 @@ def _present(
     ]
     if problems and not allow_incomplete:
         more = f" (and {len(problems) - 1} more)" if len(problems) > 1 else ""
-        text = f"{folder} is damaged: {problems[0]}{more}; {RERUN_HINT}, or omit the shard with allow_incomplete=True"
-        raise DatasetError(text)
+        raise DatasetError(
+            f"{folder} is damaged: {problems[0]}{more}; {RERUN_HINT}, or omit the shard with "
+            "allow_incomplete=True"
+        )
     return {
         split: tuple(shard for shard in part if not shard.problem())
         for split, part in shards.items()

@@ -25,8 +25,11 @@ def local_folder(folder: str | Path) -> str | Path:
     entry = addons.find(SOURCES, scheme)
     if entry is None:
         known = [f"{other.name}://" for other in addons.installed(SOURCES)]
-        text = f"{folder:.200}: no installed package reads datasets at {scheme:.50}://, only {listed(known) or 'none'}"
-        raise UsageError(text, concerns="folder")
+        raise UsageError(
+            f"{folder:.200}: no installed package reads datasets at {scheme:.50}://, only "
+            f"{listed(known) or 'none'}",
+            concerns="folder",
+        )
     download: Callable[[str], Path] = addons.load_entry(
         entry, f"a dataset at {scheme}://"
     )

@@ -10,10 +10,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
+from cnpgen.arrays import AnyArray
 from cnpgen.errors import DatasetError, UsageError
 from cnpgen.loader.shard_reader import scene_fields
 from cnpgen.store.dataset_spec import DatasetSpec
-from cnpgen.store.field import Field
+from cnpgen.store.field import Field, Fields
 from cnpgen.store.scene_table import OBSTACLE_POSES, SCENE_ARRAYS
 from cnpgen.store.statistics import FieldStatistics
 
@@ -148,15 +149,15 @@ class Columns:
     Integer fields are separate arrays.
     """
 
-    fields: tuple[Field, ...]
+    fields: Fields
 
     @cached_property
-    def floats(self) -> tuple[Field, ...]:
+    def floats(self) -> Fields:
         """The float fields, which are in the table."""
         return tuple(field for field in self.fields if field.dtype == "float")
 
     @cached_property
-    def integers(self) -> tuple[Field, ...]:
+    def integers(self) -> Fields:
         """The integer fields, which are neither in the table nor normalized."""
         return tuple(field for field in self.fields if field.dtype != "float")
 
@@ -239,7 +240,7 @@ class RowFormat:
     normalization: Normalization | None
     dtype: np.dtype[Any]
 
-    def convert(self, rows: Mapping[str, NDArray[Any]]) -> dict[str, NDArray[Any]]:
+    def convert(self, rows: Mapping[str, AnyArray]) -> dict[str, AnyArray]:
         """Convert stored rows, of shape (k, width) or (k,) each, to this format."""
         values = dict(rows)
         if self.normalization is not None:
@@ -286,8 +287,10 @@ def _own(
     spec: DatasetSpec, own: Normalization | None, normalize: object
 ) -> Normalization | None:
     if not isinstance(normalize, bool | np.bool_):
-        text = f"must be True, False or the normalization of a dataset, got {normalize!r:.100}"
-        raise UsageError(text, argument="normalize")
+        raise UsageError(
+            f"must be True, False or the normalization of a dataset, got {normalize!r:.100}",
+            argument="normalize",
+        )
     if normalize and own is None:
         raise DatasetError(
             f"{spec.name} has no training rows for the normalization; pass normalize=False, or the normalization of"

@@ -10,8 +10,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from cnpgen.arrays import AnyArray, Indices
 from cnpgen.errors import DatasetError
 from cnpgen.robots.obstacle import Obstacle
 from cnpgen.robots.scene import scene_poses
@@ -27,13 +27,13 @@ from cnpgen.store.checked_shard import (
     read_scenes,
 )
 from cnpgen.store.dataset_spec import DatasetSpec
-from cnpgen.store.field import Field
+from cnpgen.store.field import Field, Fields
 from cnpgen.store.files.atomic import file_sha256
 from cnpgen.store.intact import RERUN_HINT, digest_problem
 from cnpgen.store.scene_table import OBSTACLE_POSES, SCENE_ID, SceneTable
 from cnpgen.store.shard import StoredField, storage_dtype
 
-Rows = dict[str, NDArray[Any]]
+Rows = dict[str, AnyArray]
 # Kept open; each needs a file descriptor, and its pages can be reclaimed by the system.
 MAX_MEMORY_MAPS = 32
 
@@ -55,7 +55,7 @@ def problem_obstacles(spec: DatasetSpec) -> tuple[Obstacle, ...]:
     return tuple(obstacle for obstacle in parsed if obstacle is not None)
 
 
-def scene_fields(spec: DatasetSpec) -> tuple[Field, ...]:
+def scene_fields(spec: DatasetSpec) -> Fields:
     """Return the fields of the scene of each sample; empty for a dataset without scenes.
 
     ``obstacle_poses`` has the layout of the problem's obstacles
@@ -81,11 +81,11 @@ class SceneColumn:
 
     name: str
     table: SceneTable
-    index: NDArray[np.intp]
+    index: Indices
     obstacles: Sequence[Obstacle]
     dtype: np.dtype[Any]
 
-    def __getitem__(self, rows: Any) -> NDArray[Any]:
+    def __getitem__(self, rows: Any) -> AnyArray:
         """Return the values of rows, shape (k, width) or (k,)."""
         index = self.index[rows]
         # Poses are computed once for each scene of the rows.
@@ -93,7 +93,7 @@ class SceneColumn:
         chosen = self.table[scenes]
         if self.name == OBSTACLE_POSES:
             return scene_poses(self.obstacles, chosen).astype(self.dtype)[place]
-        values: NDArray[Any] = getattr(chosen, self.name)[place]
+        values: AnyArray = getattr(chosen, self.name)[place]
         return values.reshape(len(index), -1) if values.ndim > 1 else values
 
 
@@ -138,7 +138,7 @@ class ShardReader:
 
     def map(
         self, shard: Shard, fields: Sequence[Field]
-    ) -> dict[str, NDArray[Any] | SceneColumn]:
+    ) -> dict[str, AnyArray | SceneColumn]:
         """Map fields of a shard into memory, to use some of their rows; they are read the first time.
 
         Mapped values are read-only; fields of scenes are computed for the rows that are

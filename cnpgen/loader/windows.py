@@ -17,11 +17,11 @@ from concurrent.futures import Future
 from dataclasses import dataclass
 from functools import cached_property
 from threading import Thread
-from typing import Any, TypeVar
+from typing import TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
 
+from cnpgen.arrays import AnyArray, Array, Columns, Integers
 from cnpgen.loader.batch import Batch
 from cnpgen.loader.row_format import RowFormat
 from cnpgen.loader.shard_reader import ShardReader, SplitShards
@@ -71,12 +71,12 @@ class Order:
             first += rows
         return tuple(windows)
 
-    def rows_of(self, window: int) -> NDArray[np.int64]:
+    def rows_of(self, window: int) -> Integers:
         """Return the order of the rows of a window: indices into the concatenated rows of its shards, shape (rows,)."""
         # Stage 0 is the order of the shards.
         return self._permuted(self.windows[window].rows, stage=1 + window)
 
-    def _permuted(self, size: int, *, stage: int) -> NDArray[np.int64]:
+    def _permuted(self, size: int, *, stage: int) -> Integers:
         if not self.shuffle:
             return np.arange(size)
         # The name of the split as eight words: splits have independent orders.
@@ -86,7 +86,7 @@ class Order:
         return permutation(size, seed=self.seed, key=(*words, self.epoch, stage))
 
 
-def permutation(size: int, *, seed: int, key: tuple[int, ...]) -> NDArray[np.int64]:
+def permutation(size: int, *, seed: int, key: tuple[int, ...]) -> Integers:
     """Return a uniformly random permutation, shape (size,), that does not depend on the version of NumPy.
 
     NumPy guarantees the raw output of bit generators, but not that of
@@ -106,8 +106,8 @@ def permutation(size: int, *, seed: int, key: tuple[int, ...]) -> NDArray[np.int
 class Packed:
     """The concatenated rows of some shards: a table of float fields, shape (rows, D), and integer fields by name."""
 
-    table: NDArray[Any]
-    integers: dict[str, NDArray[Any]]
+    table: AnyArray
+    integers: Columns
 
     def part(self, first: int, last: int) -> "Packed":
         """Return the rows from ``first`` to ``last`` as views."""
@@ -117,7 +117,7 @@ class Packed:
         )
 
 
-Loaded = tuple[Packed, NDArray[np.int64]]
+Loaded = tuple[Packed, Integers]
 
 
 def row_bytes(row_format: RowFormat) -> int:
@@ -158,9 +158,9 @@ def pack(
 
 
 def _fill(
-    table: NDArray[Any],
-    columns: Mapping[str, NDArray[Any]],
-    scaling: tuple[NDArray[np.float64], NDArray[np.float64]] | None,
+    table: AnyArray,
+    columns: Mapping[str, AnyArray],
+    scaling: tuple[Array, Array] | None,
 ) -> None:
     """Copy columns side by side in chunks, so that the float64 arithmetic stays in the cache."""
     rows, width = table.shape
@@ -168,7 +168,7 @@ def _fill(
     step = min(max(_CHUNK_VALUES // width, 1), rows)
     buffer = np.empty((step, width))
     # Repeated for all rows of a chunk, so that no operation broadcasts.
-    scales: Sequence[NDArray[np.float64]] = (
+    scales: Sequence[Array] = (
         () if scaling is None else [np.tile(part, (step, 1)) for part in scaling]
     )
     copies = [
@@ -190,15 +190,13 @@ def _fill(
         table[first:last] = buffer
 
 
-def _opaque_rows(values: NDArray[Any]) -> NDArray[Any]:
+def _opaque_rows(values: AnyArray) -> AnyArray:
     """View float64 values as one opaque item per row, which NumPy copies twice as fast as rows of six numbers."""
     rows = np.ascontiguousarray(values, np.float64).reshape(len(values), -1)
     return rows.view(f"V{8 * rows.shape[1]}")[:, 0]
 
 
-def _targets(
-    buffer: NDArray[np.float64], columns: Mapping[str, NDArray[Any]]
-) -> dict[str, NDArray[Any]]:
+def _targets(buffer: Array, columns: Mapping[str, AnyArray]) -> Columns:
     """View the part of the buffer for every column as one opaque item per row."""
     targets = {}
     start = 0
@@ -224,7 +222,7 @@ class InMemoryRows:
         self._loaded: set[int] = set()
         self.packed = empty_packed(source.rows, row_format)
 
-    def load(self, shards: Sequence[int]) -> NDArray[np.int64]:
+    def load(self, shards: Sequence[int]) -> Integers:
         """Load shards, by their indices within the split, that are not in memory yet.
 
         Return the positions of their rows in ``packed``, in the order of the shards,

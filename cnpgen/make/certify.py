@@ -6,9 +6,8 @@ from pathlib import Path
 from typing import ClassVar
 
 import numpy as np
-from numpy.typing import NDArray
 
-from cnpgen.arrays import Array
+from cnpgen.arrays import Array, Mask
 from cnpgen.errors import RecipeError
 from cnpgen.kernels.library import problem_kernels
 from cnpgen.machine.threads import one_thread
@@ -25,7 +24,7 @@ from cnpgen.problems.problem import Problem
 from cnpgen.refine.refine_engine import Solver, load_solver
 from cnpgen.robots.scene import sample_obstacles, scene_poses
 from cnpgen.schema.keys import field
-from cnpgen.store.field import Field
+from cnpgen.store.field import Field, Fields
 from cnpgen.store.scene_table import OBSTACLE_KINDS, OBSTACLE_POSES, SceneTable
 from cnpgen.trajectory.spline_motion import Motion
 
@@ -63,7 +62,7 @@ class CertifiedPlan(Stage):
             " plan Pinocchio and Coal call valid on a time grid of 1 ms, with the plan"
         )
 
-    def outputs(self, context: Context) -> tuple[Field, ...]:
+    def outputs(self, context: Context) -> Fields:
         spec = context.problem.trajectory
         joints = context.robot.joint_names
         points = spec.path_control_points
@@ -95,7 +94,7 @@ class CertifiedPlan(Stage):
             Field("duration", "s", "its motion time", role="target"),
         )
 
-    def task_inputs(self, context: Context) -> tuple[Field, ...]:
+    def task_inputs(self, context: Context) -> Fields:
         return ()
 
     def prepare(self, context: Context) -> StageFunction:
@@ -114,13 +113,13 @@ class CertifiedPlan(Stage):
                 name: np.ascontiguousarray(values.T)
                 for name, values in candidates.columns.items()
             }
-            scenes, poses = None, dict[str, Array]()
+            scenes = None
             if candidates.scenes is not None:
                 scenes = candidates.scenes.table[candidates.scene]
-                poses = {OBSTACLE_POSES: scene_poses(context.problem.obstacle, scenes)}
             guess = None
             if planner is not None:
                 boundary = planner_boundary(columns, planner)
+                poses = _poses(context, scenes)
                 guess = planner.plan_batch(boundary, columns=poses).motion
             # Workers are processes already: threads of linear algebra would compete for
             # their cores.
@@ -138,6 +137,13 @@ class CertifiedPlan(Stage):
             candidates.reject(valid, NO_PLAN)
 
         return work
+
+
+def _poses(context: Context, scenes: SceneTable | None) -> dict[str, Array]:
+    """Return the columns with the obstacles of scenes; none without scenes."""
+    if scenes is None:
+        return {}
+    return {OBSTACLE_POSES: scene_poses(context.problem.obstacle, scenes)}
 
 
 def certified(
@@ -179,7 +185,7 @@ class SceneSolver:
         columns: Mapping[str, Array],
         scenes: SceneTable,
         guess: Motion | None = None,
-    ) -> tuple[Motion, NDArray[np.bool_]]:
+    ) -> tuple[Motion, Mask]:
         """Plan N rows with columns of shape (N, width), N scenes and N initial guesses; see ``load_solver``."""
         spec = self._context.problem.trajectory
         robot = self._context.robot

@@ -114,6 +114,9 @@ def complete(
     """
     problem = problem_of_poses(recipe)
     if problem is not None:
+        if extrapolate:
+            text = "has no effect on tasks with goal poses, which have no parameters"
+            raise UsageError(text, argument="extrapolate")
         poses = PoseTasks(problem)
         fields = poses.fields
         flat = False
@@ -152,8 +155,8 @@ def _completed(
 ) -> Completed:
     # Wider ranges are another problem, whose kernels and checks must be those of the
     # tasks.
-    if extrapolate and "parameters" in columns:
-        wider = extrapolated(pipeline.problem, columns["parameters"])
+    if extrapolate:
+        wider = extrapolated(pipeline.problem, columns.get("parameters", ()))
         pipeline = replace(pipeline, problem=wider)
         context = load_context(wider, *choose_backend(None))
     completion = Completion(pipeline, context, columns)
@@ -201,8 +204,10 @@ def _given(
     count = max(map(len, given.values()))
     for name, values in given.items():
         if len(values) not in {1, count}:
-            text = f"is given for {counted(len(values), 'task')}, another column for {count:,}"
-            raise UsageError(text, argument=name)
+            raise UsageError(
+                f"is given for {counted(len(values), 'task')}, another column for {count:,}",
+                argument=name,
+            )
     check_plausible(
         robot, given, {name: field.unit for name, field in fields.items()}, noun="task"
     )

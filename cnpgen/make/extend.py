@@ -106,8 +106,10 @@ def _extended(
         return begun
     # Rows are never removed.
     if any(splits.get(split, 0) < rows for split, rows in begun.splits.items()):
-        text = f"{folder} has {sum(begun.splits.values()):,} rows: choose a larger {{n}}, got {n:,}"
-        raise UsageError(text, remedies={"n": None})
+        raise UsageError(
+            f"{folder} has {sum(begun.splits.values()):,} rows: choose a larger {{n}}, got {n:,}",
+            remedies={"n": None},
+        )
     if not makes_its_rows(recipe, begun):
         raise UsageError(
             f"{folder} was made by another version of cnpgen or of its plug-ins, and this version generates other rows"

@@ -4,12 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from cnpgen.arrays import Array
+from cnpgen.arrays import Array, Columns, Mask
 from cnpgen.errors import UsageError, lacks
 from cnpgen.pipelines.resting_states import RestingStates, seeds_of
 from cnpgen.plans.boundary_problems import plans_of_rows
@@ -69,7 +67,7 @@ class EndConditions:
         # of the ends does not matter.
         self._poses = scene_of(placed, zero, zero, zero).poses[0]
 
-    def met(self, q: Array) -> NDArray[np.bool_]:
+    def met(self, q: Array) -> Mask:
         """Return which joint positions (n, K) meet the conditions within their tolerances, shape (K,)."""
         return np.array([self._are_met(state) for state in q.T], bool)
 
@@ -256,7 +254,7 @@ class PoseTasks:
         goal = np.concatenate(states)
         tasks = np.repeat(np.arange(count), [len(each) for each in states])
         numbers = np.concatenate([np.arange(len(each), dtype=float) for each in states])
-        rows: dict[str, NDArray[Any]] = {
+        rows: Columns = {
             name: np.zeros_like(goal) for name in ("start_dq", "start_ddq", "goal_dq")
         }
         rows |= {
@@ -309,8 +307,10 @@ class PoseTasks:
                 limit := PLAUSIBLE_MAX[unit]
             ):
                 hint = suggested_unit(largest, unit, high=limit)
-                text = f"must be at most {limit:.4g} {unit}, got {tolerances[name]} in task {task}{hint}"
-                raise UsageError(text, argument=name)
+                raise UsageError(
+                    f"must be at most {limit:.4g} {unit}, got {tolerances[name]} in task {task}{hint}",
+                    argument=name,
+                )
             if (tolerances[name] < 0).any():
                 raise UsageError(
                     f"must not be negative, got {tolerances[name]} in task {task}",

@@ -331,8 +331,11 @@ def _check(part: tuple[int, int] | None, *, force: bool) -> None:
     """Raise UsageError for invalid arguments or environment variables before anything is written."""
     source_date()
     if part is not None and force:
-        text = "{force} would delete what the other parts have made: remove the folder, then start the parts"
-        raise UsageError(text, remedies={"force": True})
+        raise UsageError(
+            "{force} would delete what the other parts have made: remove the folder, then start the "
+            "parts",
+            remedies={"force": True},
+        )
 
 
 def find_damaged(

@@ -7,11 +7,10 @@ from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from cnpgen.arrays import Columns
 from cnpgen.errors import MachineError
 from cnpgen.kernels.library import Backend, choose_backend
 from cnpgen.machine.versions import versions
@@ -131,7 +130,7 @@ def _now(job: Job) -> str:
 
 def shard_columns(
     prepared: PreparedPipeline, spec: DatasetSpec, tasks: Sequence[ShardTask]
-) -> Iterator[tuple[dict[str, NDArray[Any]], SamplingStatistics, SceneTable | None]]:
+) -> Iterator[tuple[Columns, SamplingStatistics, SceneTable | None]]:
     """Compute the rows of shards of one split; every block is computed once.
 
     Yield the columns as stored, shape (rows, width) or (rows,), the sampling
@@ -177,7 +176,7 @@ def blocks_of(task: ShardTask, size: int) -> range:
 
 def stored_columns(
     parts: Sequence[Block], fields: Sequence[Field], dtype: str
-) -> dict[str, NDArray[Any]]:
+) -> Columns:
     """Concatenate chunks to the stored values of their fields, shape (rows, width) or (rows,) each."""
     columns = {}
     for item in fields:
@@ -190,7 +189,7 @@ def stored_columns(
 
 def spot_check(
     prepared: PreparedPipeline,
-    columns: dict[str, NDArray[Any]],
+    columns: Columns,
     spec: DatasetSpec,
     task: ShardTask,
     scenes: SceneTable | None = None,

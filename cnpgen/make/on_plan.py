@@ -5,9 +5,8 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
-from cnpgen.arrays import Array
+from cnpgen.arrays import Array, Indices, Mask
 from cnpgen.errors import RecipeError
 from cnpgen.kernels.symbolic.kinematics import tip_position
 from cnpgen.machine.threads import one_thread
@@ -25,7 +24,7 @@ from cnpgen.plans.format import BOUNDARY, CONDITIONS
 from cnpgen.problems.constraints.table import Table
 from cnpgen.problems.problem_record import record_problem
 from cnpgen.schema.keys import Range, field
-from cnpgen.store.field import Field
+from cnpgen.store.field import Fields
 from cnpgen.store.files.atomic import file_sha256
 from cnpgen.trajectory.boundary import Boundary
 from cnpgen.trajectory.spline_motion import Motion, states_at_times
@@ -119,7 +118,7 @@ class StartOnPlan(Stage):
             " on refined plans"
         )
 
-    def outputs(self, context: Context) -> tuple[Field, ...]:
+    def outputs(self, context: Context) -> Fields:
         quantities = (
             ("rad", "positions"),
             ("rad/s", "velocities"),
@@ -180,16 +179,14 @@ class StartOnPlan(Stage):
 
     def _maker(
         self, context: Context
-    ) -> Callable[[CandidateBatch, NDArray[np.bool_]], tuple[NDArray[np.intp], Motion]]:
+    ) -> Callable[[CandidateBatch, Mask], tuple[Indices, Motion]]:
         """Return a function that computes a motion for every candidate and the index of its owner."""
         from cnpgen.refine.refine_engine import load_solver
 
         planner = load_stage_planner(self.model, self.sha256, context)
         solve = load_solver(context.problem, context.robot, context.kernels)
 
-        def make(
-            candidates: CandidateBatch, refined: NDArray[np.bool_]
-        ) -> tuple[NDArray[np.intp], Motion]:
+        def make(candidates: CandidateBatch, refined: Mask) -> tuple[Indices, Motion]:
             columns = {
                 name: np.ascontiguousarray(values.T)
                 for name, values in candidates.columns.items()

@@ -3,7 +3,7 @@
 import hashlib
 import json
 import tempfile
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from fractions import Fraction
@@ -11,6 +11,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+from cnpgen.arrays import JsonMapping, JsonObject
 from cnpgen.errors import PluginError, RecipeError, UsageError
 from cnpgen.pipelines.pipeline import Pipeline, listed_tasks, read_pipeline
 from cnpgen.pipelines.stages.stage import Stage
@@ -113,7 +114,7 @@ def recipe_digest(recipe: Pipeline | DatasetRecipe) -> str:
     return resolved_digest(resolved(pipeline), pipeline.problem.urdf_text.encode())
 
 
-def resolved_digest(pipeline: Mapping[str, Any], urdf: bytes) -> str:
+def resolved_digest(pipeline: JsonMapping, urdf: bytes) -> str:
     """Hash the result of ``resolved`` for a pipeline, for example from the specification of a dataset, and its URDF.
 
     See ``recipe_digest``.
@@ -168,7 +169,7 @@ def as_dataset_recipe(recipe: object) -> DatasetRecipe:
 
 
 def restore_dataset_recipe(
-    content: dict[str, Any], urdf: str, folder: Path
+    content: JsonObject, urdf: str, folder: Path
 ) -> DatasetRecipe:
     """Rebuild a recipe from its resolved form in a specification.
 
@@ -274,9 +275,11 @@ def load_notes(recipe: DatasetRecipe) -> str:
         return ""
     card = recipe.path.with_suffix(".md")
     try:
-        hint = "; it becomes part of the dataset's card"
         return (
-            utf8_text(read_own(card, recipe.path, "notes"), hint=hint)
+            utf8_text(
+                read_own(card, recipe.path, "notes"),
+                hint="; it becomes part of the dataset's card",
+            )
             if card.is_file()
             else ""
         )

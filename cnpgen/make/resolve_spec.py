@@ -3,10 +3,10 @@
 import hashlib
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
+from cnpgen.arrays import JsonObject
 from cnpgen.errors import UsageError
 from cnpgen.kernels.library import choose_backend
 from cnpgen.machine.versions import versions
@@ -195,7 +195,7 @@ def _solved_tasks(
     return min(rows, requested)
 
 
-def _robot_record(prepared: PreparedPipeline) -> dict[str, Any]:
+def _robot_record(prepared: PreparedPipeline) -> JsonObject:
     robot = prepared.context.robot
     limits = {
         name: [float(x) for x in getattr(robot, name)]

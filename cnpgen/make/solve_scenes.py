@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from cnpgen.arrays import Array
+from cnpgen.arrays import Array, JsonObject, Mask
 from cnpgen.errors import UsageError, counted
 from cnpgen.machine.engine import Engine
 from cnpgen.machine.times import NO_TIME, Times
@@ -114,14 +113,14 @@ class SolvedScenes:
     times: Times = NO_TIME
 
     def __repr__(self) -> str:
-        return f"<{len(self.scenes)} scenes of {self.plans.problem.name!r}, {int(self.valid.sum())} solved>"
+        return f"<{counted(len(self.scenes), 'scene')} of {self.plans.problem.name!r}, {int(self.valid.sum())} solved>"
 
     @property
-    def valid(self) -> NDArray[np.bool_]:
+    def valid(self) -> Mask:
         """Mask of the scenes with a plan that the independent verdict accepts, shape (N,)."""
         return np.array([result.valid for result in self.results], bool)
 
-    def summary(self) -> dict[str, Any]:
+    def summary(self) -> JsonObject:
         """Return a summary for JSON.
 
         Unsolved scenes have a name, a reason and an explanation.
@@ -201,38 +200,52 @@ def solve_scenes(
     )
     check_scenes(scenes)
     loaded, robot, scenes = _requested(as_problem(problem), scenes, chosen)
-    # One tree has all goals as roots; without a limit each of them is optimized.
-    most = MAX_GOAL_STATES if options.time_limit is None else MAX_TREE_GOALS
-    goals = [
-        _goals(loaded, robot, scene, index, most=most)
-        for index, scene in enumerate(scenes)
-    ]
+    goals = _goals_of_all(loaded, robot, scenes, options)
     if chosen.begin is not None:
         chosen.begin(len(scenes), 0)
+    groups = _groups(scenes)
+    journals = _journals(journal, len(groups))
     refine = _refiner(chosen, progress, options, workers=workers, discard=discard)
-    capacity = capacity_of(scenes)
     found = dict[int, tuple[Plans, Attempt]]()
     times = NO_TIME
-    journals = list[Path]()
     # Scenes of one capacity share kernels; each group has its own journal.
-    for own, indices in _groups(scenes):
-        file = None if journal is None else Path(f"{journal}.{len(journals)}")
-        journals += [] if file is None else [file]
-        of_group = [(index, goals[index]) for index in indices]
+    for (own, indices), file in zip(groups, journals, strict=True):
+        of_group = {index: goals[index] for index in indices}
         plans = _adjusted(_plans_of(loaded, scenes, of_group, own), chosen)
         refinement = refine(plans, journal=file)
         times += refinement.times
         # Plans of one file have the same obstacles: smaller groups get parked ones.
-        wide = with_wider_capacity(_without_options(refinement), loaded, own, capacity)
-        attempts = zip(indices, refinement.results, strict=True)
-        for row, (index, attempt) in enumerate(attempts):
-            found[index] = wide[row], _with_reason(attempt, goals[index])
+        wide = with_wider_capacity(refinement.plans, loaded, own, capacity_of(scenes))
+        found |= _found(of_group, wide, refinement.results)
     every, results = zip(*(found[index] for index in range(len(scenes))), strict=True)
-    solved = SolvedScenes(tuple(scenes), concatenate(every), results, times)
     # The journals serve to resume; a finished run needs none.
-    for file in journals:
+    for file in filter(None, journals):
         file.unlink(missing_ok=True)
-    return solved
+    return SolvedScenes(tuple(scenes), concatenate(every), results, times)
+
+
+def _journals(journal: str | Path | None, count: int) -> list[Path | None]:
+    """Return the journals of some groups of scenes: numbered ones, or none."""
+    if journal is None:
+        return [None] * count
+    return [Path(f"{journal}.{number}") for number in range(count)]
+
+
+def _found(
+    goals: Mapping[int, Array], plans: Plans, results: Sequence[Attempt]
+) -> dict[int, tuple[Plans, Attempt]]:
+    """Return plan and attempt of the scenes of one group, by their indices, as the keys of ``goals``."""
+    # One column numbers the goal states of a scene; only the best one is left.
+    columns = {
+        name: values for name, values in plans.columns.items() if name != GOAL_OPTION
+    }
+    plans = replace(plans, columns=columns)
+    # Goal poses without joint positions are the reason of their scenes.
+    attempts = (
+        replace(result, reason=POSE_REASON) if np.isnan(states).all() else result
+        for states, result in zip(goals.values(), results, strict=True)
+    )
+    return dict(zip(goals, zip(plans, attempts, strict=True), strict=True))
 
 
 def _requested(
@@ -305,21 +318,6 @@ def _adjusted(plans: Plans, run: SceneOptions) -> Plans:
     return replace(plans, boundary=replace(plans.boundary, goal_ddq=zero))
 
 
-def _without_options(refinement: Refinement) -> Plans:
-    """Return the plans without the column that numbers the goal states of one scene."""
-    plans = refinement.plans
-    columns = {
-        name: values for name, values in plans.columns.items() if name != GOAL_OPTION
-    }
-    return replace(plans, columns=columns)
-
-
-def _with_reason(attempt: Attempt, goals: Array) -> Attempt:
-    """Return an attempt, with the reason of a scene whose goal pose has no joint positions."""
-    without_goal = np.isnan(goals).all()
-    return replace(attempt, reason=POSE_REASON) if without_goal else attempt
-
-
 def _groups(scenes: Sequence[SceneProblem]) -> list[tuple[dict[str, int], list[int]]]:
     """Return the capacities of the scenes with the indices of the scenes of each."""
     groups: dict[tuple[tuple[str, int], ...], list[int]] = {}
@@ -331,13 +329,13 @@ def _groups(scenes: Sequence[SceneProblem]) -> list[tuple[dict[str, int], list[i
 def _plans_of(
     problem: Problem,
     scenes: Sequence[SceneProblem],
-    goals: Sequence[tuple[int, Array]],
+    goals: Mapping[int, Array],
     capacity: Capacity,
 ) -> Plans:
     """Return boundary problems of scenes of one capacity, by index, one for each goal state, shape (G, n) each."""
     options = [
         (index, option, goal)
-        for index, states in goals
+        for index, states in goals.items()
         for option, goal in enumerate(states)
     ]
     rows, numbers, states = zip(*options, strict=True)
@@ -353,6 +351,21 @@ def _plans_of(
         if any(numbers)
         else plans
     )
+
+
+def _goals_of_all(
+    problem: Problem,
+    robot: Robot,
+    scenes: Sequence[SceneProblem],
+    options: RefineOptions,
+) -> list[Array]:
+    """Return the goal states that are tried for each scene."""
+    # One tree has all goals as roots; without a limit each of them is optimized.
+    most = MAX_GOAL_STATES if options.time_limit is None else MAX_TREE_GOALS
+    return [
+        _goals(problem, robot, scene, index, most=most)
+        for index, scene in enumerate(scenes)
+    ]
 
 
 def _goals(

@@ -10,9 +10,8 @@ from collections.abc import Callable, Collection
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from cnpgen.arrays import Array
+from cnpgen.arrays import Array, Mask
 from cnpgen.kernels.symbolic.linalg import Scalar, Vec, dot, subtract, symbols
 from cnpgen.kernels.symbolic.symbolic_state import SymbolicState
 from cnpgen.pipelines.stages.collision import candidate_poses
@@ -33,7 +32,6 @@ from cnpgen.robots.scene import scene_capacity
 from cnpgen.world.path import PathWorld
 from cnpgen.world.world import World
 
-Mask = NDArray[np.bool_]
 States = tuple[Array, Array, Array]
 
 Decide = Callable[[States, Array, Mask, CandidateBatch | None], Mask]
@@ -240,7 +238,8 @@ def narrow_phase_of_scenes(context: Context, end: End, *, exact: bool = True) ->
     Compiled collision checks accept states whose distances are more than
     ``MIN_SCENE_MARGIN_M`` above the required ones; Coal measures the others.
     """
-    problem, clearance = context.problem, SceneClearance(context)
+    problem = context.problem
+    clearance = SceneClearance(context)
     kinds = RobotClearance | SelfClearance
     by_distance = np.array(
         [isinstance(each, kinds) for each in problem.constraint], bool
@@ -265,7 +264,8 @@ def narrow_phase_of_scenes(context: Context, end: End, *, exact: bool = True) ->
         remaining = np.zeros((len(by_distance), len(mask)), bool)
         clear = np.zeros(len(mask), bool)
         if candidates is not None and candidates.scenes is not None:
-            q, margins = np.ascontiguousarray(state[0], float), [MIN_SCENE_MARGIN_M] * 2
+            q = np.ascontiguousarray(state[0], float)
+            margins = [MIN_SCENE_MARGIN_M] * 2
             scene, scenes = candidates.scene, candidates.scenes
             clear = clearance.are_clear(q, scene, scenes, *margins)
         # Compiled code proves most states clear; Coal decides on the others.

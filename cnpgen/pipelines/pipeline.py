@@ -1,11 +1,11 @@
 """Pipelines: stages that sample the boundary conditions of a problem, their files, and the fields that they store."""
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Any
 
+from cnpgen.arrays import JsonMapping, NamedErrors
 from cnpgen.errors import PluginError, RecipeError, UsageError
 from cnpgen.pipelines.stages.draw_scenes import DrawScenes
 from cnpgen.pipelines.stages.stage import Context, Stage, StageFunction
@@ -18,7 +18,7 @@ from cnpgen.schema.catalogue import load_recipe, read_kind, reference
 from cnpgen.schema.keys import NAME, RecipeLocation, field
 from cnpgen.schema.parsing import Reader, parse, stored_values
 from cnpgen.schema.toml import read_table
-from cnpgen.store.field import Field
+from cnpgen.store.field import Field, Fields
 from cnpgen.store.scene_table import SCENE_ID
 
 MAX_STAGES = 100
@@ -58,7 +58,7 @@ class Pipeline:
     stage: tuple[Stage, ...] = field("stages, in order", form="[[stage]] tables")
     path: Path = Path()
 
-    def validate(self) -> Iterator[tuple[str, str]]:
+    def validate(self) -> NamedErrors:
         """Yield (key, error) pairs."""
         if (count := len(self.stage)) > MAX_STAGES:
             yield "stage", f"there are {count:,} stages, expected at most {MAX_STAGES}"
@@ -144,7 +144,7 @@ def _with_places(
 
 
 def restore_pipeline(
-    name: str, stages: Sequence[Mapping[str, Any]], problem: Problem
+    name: str, stages: Sequence[JsonMapping], problem: Problem
 ) -> Pipeline:
     """Rebuild a pipeline from the resolved stages of a dataset or model specification."""
     tables = [dict(stage) for stage in stages]
@@ -193,7 +193,7 @@ def steps_of(pipeline: Pipeline) -> list[PipelineStep]:
     ]
 
 
-def stored_fields(steps: Sequence[PipelineStep], context: Context) -> tuple[Field, ...]:
+def stored_fields(steps: Sequence[PipelineStep], context: Context) -> Fields:
     """Merge the outputs of the stages, in stored order.
 
     Raise RecipeError if two stages declare a field differently.
@@ -222,12 +222,19 @@ def stored_fields(steps: Sequence[PipelineStep], context: Context) -> tuple[Fiel
     )
 
 
-def bookkeeping_fields(*, scenes: bool = False) -> tuple[Field, ...]:
+def bookkeeping_fields(*, scenes: bool = False) -> Fields:
     """Return the bookkeeping fields of every dataset, and with ``scenes`` that of the scene of a row."""
-    text = "sample_id of the first row in the same scene"
     return (
         *(
-            (Field(SCENE_ID, "1", text, role="context", dtype="int64"),)
+            (
+                Field(
+                    SCENE_ID,
+                    "1",
+                    "sample_id of the first row in the same scene",
+                    role="context",
+                    dtype="int64",
+                ),
+            )
             if scenes
             else ()
         ),

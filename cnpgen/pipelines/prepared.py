@@ -5,12 +5,10 @@ from collections import deque
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from cnpgen.arrays import Array
+from cnpgen.arrays import Array, Columns, Indices, Integers
 from cnpgen.errors import RecipeError, UsageError
 from cnpgen.kernels.library import Backend
 from cnpgen.pipelines.acceptance import acceptance
@@ -25,7 +23,7 @@ from cnpgen.pipelines.pipeline import (
 from cnpgen.pipelines.stages.draw_scenes import DrawScenes
 from cnpgen.pipelines.stages.stage import CandidateBatch, load_context
 from cnpgen.problems.constraints.constraint import BOUNDARY_TOLERANCES
-from cnpgen.store.field import Field
+from cnpgen.store.field import Field, Fields
 from cnpgen.store.sampling_statistics import DensityMap, SamplingStatistics
 from cnpgen.store.scene_table import SCENE_ID, SceneTable, concatenate_scenes
 
@@ -47,7 +45,7 @@ class Block:
             without scenes.
     """
 
-    columns: dict[str, NDArray[Any]]
+    columns: Columns
     sampling: SamplingStatistics
     scenes: SceneTable | None = None
 
@@ -208,11 +206,11 @@ class PreparedPipeline:
 class BlockChunk:
     """Rows ``first`` to ``stop``, exclusive, of a block, collected batch by batch, with counts of all candidates."""
 
-    def __init__(self, fields: tuple[Field, ...], first: int, stop: int) -> None:
+    def __init__(self, fields: Fields, first: int, stop: int) -> None:
         self.first = first
         self.stop = stop
         self._fields = [field for field in fields if field.name not in BOOKKEEPING]
-        self._parts: list[dict[str, NDArray[Any]]] = []
+        self._parts: list[Columns] = []
         self._scenes: list[SceneTable] = []
         # Candidates, and those since the last accepted one.
         self._tried = 0
@@ -258,7 +256,7 @@ class BlockChunk:
         return end == self.stop
 
     def _take_scenes(
-        self, table: SceneTable, scene: NDArray[np.int64], rows: slice, accepted: int
+        self, table: SceneTable, scene: Integers, rows: slice, accepted: int
     ) -> None:
         """Append the scenes of some rows of a batch; IDs are rows of the block."""
         # Of the scene of each row.
@@ -270,11 +268,11 @@ class BlockChunk:
     def _count(
         self,
         candidates: CandidateBatch,
-        taken: NDArray[np.intp],
+        taken: Indices,
         *,
         first: int,
         last: bool,
-    ) -> NDArray[np.int64]:
+    ) -> Integers:
         """Count the candidates after the ``first`` rows, up to the last row or all.
 
         Return the candidates per row.
@@ -353,7 +351,7 @@ def _extent(field: Field) -> tuple[tuple[float, float], tuple[float, float]]:
     )
 
 
-def _cells(position: Array, field: Field) -> NDArray[np.intp]:
+def _cells(position: Array, field: Field) -> Indices:
     """Return the index of the cell of each position, for positions of shape (3, n)."""
     index = np.zeros(position.shape[1], np.intp)
     for axis, (low, high) in enumerate(_extent(field)):

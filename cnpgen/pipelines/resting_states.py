@@ -5,9 +5,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
-from cnpgen.arrays import Array
+from cnpgen.arrays import Array, Mask
 from cnpgen.errors import UsageError
 from cnpgen.problems.constraints.clearance import RobotClearance
 from cnpgen.problems.constraints.link_clearance import SelfClearance
@@ -55,7 +54,7 @@ class RestingStates:
         """Replace the obstacles by as many others, see ``Scene.bodies``."""
         self._solids = list(solids)
 
-    def are_clear(self, q: Array, *, margin: float = 0.0) -> NDArray[np.bool_]:
+    def are_clear(self, q: Array, *, margin: float = 0.0) -> Mask:
         """Return whether nothing collides at each state q [rad], shape (n, K).
 
         The margin [m] is added to the problem's distance of links from obstacles.
@@ -74,7 +73,7 @@ class RestingStates:
             )
         return clear
 
-    def can_hold(self, q: Array) -> NDArray[np.bool_]:
+    def can_hold(self, q: Array) -> Mask:
         """Return whether the holding torques are within their limits at each state, shape (K,)."""
         import pinocchio as pin
 
@@ -90,7 +89,7 @@ class RestingStates:
             bool,
         )
 
-    def are_ends(self, q: Array, *, margin: float = 0.0) -> NDArray[np.bool_]:
+    def are_ends(self, q: Array, *, margin: float = 0.0) -> Mask:
         """Return which states can start or end a motion: within limits, clear, and with feasible torques."""
         robot = self._robot
         inside = (q >= robot.position_lower[:, None]) & (

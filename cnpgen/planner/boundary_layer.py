@@ -87,10 +87,8 @@ class BoundaryLayer:
         backend: Backend | None = None,
         cache_folder: str | Path | None = None,
     ) -> None:
-        self.problem, self.path_scale = (
-            as_problem(problem),
-            number("path_scale", path_scale),
-        )
+        self.problem = as_problem(problem)
+        self.path_scale = number("path_scale", path_scale)
         line_steps = integer("line_projection_steps", line_projection_steps, least=0)
         self.projection_steps = integer("projection_steps", projection_steps, least=0)
         check_choice("expected_time", expected_time, EXPECTED_TIMES)
@@ -129,11 +127,9 @@ class BoundaryLayer:
     ) -> tuple[TaskPreprocessor, Projection | None]:
         # Kernels omit the obstacles that samples place; features and losses measure
         # them.
-        robot, problem, kernels = (
-            self._kernels.arguments["robot"],
-            self.problem.for_planning,
-            self._kernels,
-        )
+        robot = self._kernels.arguments["robot"]
+        problem = self.problem.for_planning
+        kernels = self._kernels
         fixed, placed = self._fixed_at_goal, self.problem.sample_obstacles
         prepare = make_task_preprocessor(
             problem,
@@ -229,10 +225,8 @@ class BoundaryLayer:
         Raises:
             UsageError: A shape is wrong, or a value is no real number.
         """
-        points, projection = (
-            self._before_projection(tasks, phi, log_rate),
-            self._preprocessor_and_projection[1],
-        )
+        points = self._before_projection(tasks, phi, log_rate)
+        projection = self._preprocessor_and_projection[1]
         if projection is None:
             return points
         # An overflow affects its own row only.
@@ -269,10 +263,8 @@ class BoundaryLayer:
         Returns:
             Gradients with respect to phi and log_rate.
         """
-        points, projection = (
-            self._before_projection(tasks, phi, log_rate),
-            self._preprocessor_and_projection[1],
-        )
+        points = self._before_projection(tasks, phi, log_rate)
+        projection = self._preprocessor_and_projection[1]
         path_gradient = _checked_gradient(
             "path_gradient", path_gradient, points.path.shape
         )
@@ -287,14 +279,13 @@ class BoundaryLayer:
                 if projection
                 else path_gradient
             )
-            spec = self.problem.trajectory
             gradients = control_points.vjp(
                 tasks,
                 points,
                 path_gradient=by_path,
                 rate_gradient=rate_gradient,
                 scale=self.path_scale,
-                spec=spec,
+                spec=self.problem.trajectory,
             )
         # An overflow of one plan must not stop training: its gradient is left out.
         overflowed = _finite(path_gradient, rate_gradient) & ~_finite(*gradients)

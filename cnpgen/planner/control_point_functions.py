@@ -64,11 +64,9 @@ def line_change(
     """
     import casadi as ca
 
-    (ends_sx, ends), rate, spec = (
-        symbols("ends", (3 + fixed_at_goal) * robot.n),
-        ca.SX.sym("rate"),
-        problem.trajectory,
-    )
+    (ends_sx, ends) = symbols("ends", (3 + fixed_at_goal) * robot.n)
+    rate = ca.SX.sym("rate")
+    spec = problem.trajectory
     poses_sx, obstacle_poses = symbols("obstacle_poses", problem.scene_width)
     # Equal rate control points are a constant rate: r' = 0 at the ends.
     points = _points(_split(ends, robot.n), [rate] * spec.rate_control_points, spec)
@@ -247,10 +245,8 @@ def projection_change(
     control, interior = list(control), slice(3, len(control) - fixed_at_goal)
     # Boundary control points stay: they meet the boundary conditions exactly.
     table, response = collocation(problem.trajectory.degree, len(control), interior)
-    equality, total = (
-        equality_residuals(robot, problem),
-        [[0.0] * robot.n for _ in response],
-    )
+    equality = equality_residuals(robot, problem)
+    total = [[0.0] * robot.n for _ in response]
     for _ in range(steps):
         # Positions at the phases; only interior points move them.
         q = [_combined(row, control) for row in table]

@@ -137,12 +137,10 @@ def speed_coefficients(robot: Robot, problem: Problem) -> Any:
     """
     import casadi as ca
 
-    columns, values, zero = (
-        _on_path(robot, problem)[0],
-        speed_residuals(robot, problem),
-        ca.SX.zeros(robot.n),
-    )
+    columns, _ = _on_path(robot, problem)
+    values = speed_residuals(robot, problem)
     p, p1, p2, rates, obstacle_poses = columns
+    zero = ca.SX.zeros(robot.n)
     drive = robot.drive
     friction = [p1 * rates[0]] if has_friction(robot) else []
     # Three evaluations determine the coefficients: at rest (constant), at p' and p''

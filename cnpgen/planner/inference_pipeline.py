@@ -210,10 +210,20 @@ class InferencePipeline:
             "start_xyz": tasks.start_xyz,
             "goal_xyz": tasks.goal_xyz,
         }
-        ids = np.arange(len(boundary)) if sample_id is None else sample_id
-        status = np.zeros(len(boundary), np.uint8)  # unknown
-        parts = boundary, motion.path, motion.rate, motion.degree, columns, ids, status
-        plans = unchecked(Plans, model.problem, *parts, "", "", False)
+        plans = unchecked(
+            Plans,
+            model.problem,
+            boundary,
+            motion.path,
+            motion.rate,
+            motion.degree,
+            columns,
+            np.arange(len(boundary)) if sample_id is None else sample_id,
+            np.zeros(len(boundary), np.uint8),  # unknown
+            "",
+            "",
+            False,
+        )
         # All other shapes follow from the model.
         if sample_id is not None or len(columns) > 2:
             plans.__post_init__()
@@ -254,21 +264,21 @@ class InferencePipeline:
         return outputs, rows(path, tasks.boundary.start_q.shape[1])
 
     def _fitted(self, motion: Motion, obstacle_poses: Array) -> Motion:
-        # Uniform time scaling slows those motions that are still beyond their limits.
-        violating = np.arange(len(motion))
+        beyond_limits: slice | NDArray[np.bool_] = slice(None)
         if self.time_parametrization is not None:
             motion, meets_limits = self.time_parametrization.parametrize(
                 motion, obstacle_poses
             )
-            violating = np.flatnonzero(~meets_limits)
-        if self.time_scaling is None or not len(violating):
+            beyond_limits = ~meets_limits
+        if self.time_scaling is None:
             return motion
+        # Uniform time scaling slows those motions that are still beyond their limits.
         factor = np.ones(len(motion))
-        factor[violating] = self.time_scaling.factor(
-            motion[violating], obstacle_poses[violating]
+        factor[beyond_limits] = self.time_scaling.factor(
+            motion[beyond_limits], obstacle_poses[beyond_limits]
         )
         # A factor of 1 leaves the rates to the bit.
-        return motion if factor.max() <= 1 else motion.time_scaled(factor)
+        return motion if factor.max(initial=1.0) <= 1 else motion.time_scaled(factor)
 
     def _with_via_points(
         self, via_points: ViaPoints, model: Model, tasks: Tasks, motion: Motion
@@ -277,67 +287,66 @@ class InferencePipeline:
 
         Replace violating and slow ones by better ones through via points or straighter.
         """
-        path, rate, violation = (
-            motion.path.copy(),
-            motion.rate.copy(),
-            via_points.violation(motion, tasks.scene.poses),
-        )
+        path, rate = motion.path.copy(), motion.rate.copy()
+        violation = via_points.violation(motion, tasks.scene.poses)
         fitted, kept = np.empty_like(rate), np.ones(len(path), bool)
         correction = np.zeros_like(path[:, self._interior(tasks.boundary)])
         correction += 0.0 if tasks.correction is None else tasks.correction
-        violating, count = (
-            np.flatnonzero(violation > 1),
-            min(MAX_LINES, len(via_points.via_points)),
-        )
+        violating = np.flatnonzero(violation > 1)
         # Blocks limit the memory: each violating task has several lines.
         for some in (violating[block] for block in blocks_of_motions(len(violating))):
-            repeated = np.repeat(some, len(via_points.via_points))
-            lines = self.prepare(
-                tasks.boundary[repeated], np.tile(via_points.via_points, (len(some), 1))
-            )
-            # The lines themselves are ranked first, since planning along all of them
-            # costs more.
-            alternatives = lines.take(via_points.best_lines(lines, count))
-            assert alternatives.correction is not None
-            motions = self._projected(
-                model, alternatives, ends_of(alternatives.boundary)
-            )
-            poses = alternatives.scene.poses
-            after = via_points.lower_bound(motions, poses)
-            candidates = via_points.candidates(after, count)
-            others, time = (
-                self._fitted(motions[candidates], poses[candidates]),
-                np.full(len(motions), np.inf),
-            )
-            # Motions that are no candidates keep an infinite time, and are never the
-            # fastest.
-            time[candidates] = others.duration_bound()
-            fastest = time.reshape(len(some), -1).argmin(axis=1) + count * np.arange(
-                len(some)
-            )
-            unclear = fastest[after[fastest] > 1]  # lower bounds
-            after[unclear] = via_points.violation(motions[unclear], poses[unclear])
+            other, *values = self._fastest_alternatives(via_points, model, tasks, some)
             # An alternative that violates as much as the first plan does not replace
             # it.
-            better = after[fastest] < violation[some]
-            replaced, fastest = some[better], fastest[better]
-            path[replaced], rate[replaced] = (
-                motions.path[fastest],
-                motions.rate[fastest],
-            )
-            fitted[replaced] = others.rate[np.searchsorted(candidates, fastest)]
-            violation[replaced], correction[replaced] = (
-                after[fastest],
-                alternatives.correction[fastest],
-            )
+            better = values[0] < violation[some]
+            replaced = some[better]
+            path[replaced], rate[replaced] = other.path[better], other.rate[better]
+            for array, value in zip(
+                (violation, fitted, correction), values, strict=True
+            ):
+                array[replaced] = value[better]
             kept[replaced] = False
         # Rates are fitted once each: of replaced motions above, of all others here.
         fitted[kept] = self._fitted(motion[kept], tasks.scene.poses[kept]).rate
         self._shorten(
             via_points, tasks, Motion(path, rate, motion.degree), fitted, violation
         )
-        return replace(tasks, correction=correction), Motion(
-            path, fitted, motion.degree
+        tasks = replace(tasks, correction=correction)
+        return tasks, Motion(path, fitted, motion.degree)
+
+    def _fastest_alternatives(
+        self, via_points: ViaPoints, model: Model, tasks: Tasks, some: NDArray[np.intp]
+    ) -> tuple[Motion, Array, Array, Array]:
+        """Plan some tasks along lines through via points; return the fastest motion of each without violation.
+
+        If all have one it is that with the smallest. Their violations, fitted rates and
+        the offsets of their lines follow.
+        """
+        count = min(MAX_LINES, len(via_points.via_points))
+        repeated = np.repeat(some, len(via_points.via_points))
+        lines = self.prepare(
+            tasks.boundary[repeated], np.tile(via_points.via_points, (len(some), 1))
+        )
+        # The lines themselves are ranked first, since planning along all of them costs
+        # more.
+        alternatives = lines.take(via_points.best_lines(lines, count))
+        assert alternatives.correction is not None
+        motions = self._projected(model, alternatives, ends_of(alternatives.boundary))
+        poses, time = alternatives.scene.poses, np.full(len(motions), np.inf)
+        violation = via_points.lower_bound(motions, poses)
+        candidates = via_points.candidates(violation, count)
+        fitted = self._fitted(motions[candidates], poses[candidates])
+        # Motions that are no candidates keep an infinite time, and are never the
+        # fastest.
+        time[candidates] = fitted.duration_bound()
+        fastest = time.reshape(-1, count).argmin(axis=1) + count * np.arange(len(some))
+        unclear = fastest[violation[fastest] > 1]  # lower bounds
+        violation[unclear] = via_points.violation(motions[unclear], poses[unclear])
+        return (
+            motions[fastest],
+            violation[fastest],
+            fitted.rate[np.searchsorted(candidates, fastest)],
+            alternatives.correction[fastest],
         )
 
     def _shorten(
@@ -361,10 +370,8 @@ class InferencePipeline:
         # A part of the offsets leads the path between its line and the straight one.
         part = lanes((OFFSET_FRACTION * offsets).reshape(len(slow), -1))
         (path,) = self.path(ends_of(some.boundary), part, rate, some.scene.lanes)
-        other, poses = (
-            Motion(rows(path, motion.path.shape[2]), motion.rate[slow], motion.degree),
-            some.scene.poses,
-        )
+        path, poses = rows(path, motion.path.shape[2]), some.scene.poses
+        other = Motion(path, motion.rate[slow], motion.degree)
         free = np.flatnonzero(via_points.lower_bound(other, poses) <= 1)
         other = self._fitted(other[free], poses[free])
         # Shorter motions replace the others only if they have no violation either.

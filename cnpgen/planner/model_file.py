@@ -173,10 +173,8 @@ def model_content(model: Model) -> Content:
     for layer in model.architecture.all_layers:
         arrays[f"{layer.name}_weight"] = layer.weight(model.parameters)
         arrays[f"{layer.name}_bias"] = layer.bias(model.parameters)
-    arrays["feature_mean"], arrays["feature_scale"] = (
-        model.features.mean,
-        model.features.scale,
-    )
+    arrays["feature_mean"] = model.features.mean
+    arrays["feature_scale"] = model.features.scale
     description = {
         "architecture": asdict(model.architecture),
         "features": list(model.features.blocks),

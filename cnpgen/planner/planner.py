@@ -95,15 +95,13 @@ class Planner:
             self._numbers_per_plan = (
                 self.robot.n * spec.path_control_points + spec.rate_control_points
             )
-            limits = {
-                "dq": loaded.robot.velocity_limit,
-                "ddq": loaded.robot.acceleration_limit,
-            }
-            ends = ("start", "goal")
+            velocity = REST_TOLERANCE * self.robot.velocity_limit
+            acceleration = REST_TOLERANCE * self.robot.acceleration_limit
             self._rest_tolerance = {
-                f"{end}_{name}": REST_TOLERANCE * limits[name]
-                for end in ends
-                for name in limits
+                "start_dq": velocity,
+                "start_ddq": acceleration,
+                "goal_dq": velocity,
+                "goal_ddq": acceleration,
             }
 
     def __repr__(self) -> str:
@@ -245,10 +243,8 @@ class Planner:
         q, dq, ddq = plans.states_at(time)
         parameters = plans.boundary.parameters if parameters is None else parameters
         states = q, dq, ddq, goal_q, goal_dq, goal_ddq
-        boundary, columns = (
-            boundary_of(self.robot.n, *states, parameters),
-            dict[str, Array](),
-        )
+        boundary = boundary_of(self.robot.n, *states, parameters)
+        columns = dict[str, Array]()
         if (poses := plans.columns.get(OBSTACLE_POSES)) is not None:
             columns[OBSTACLE_POSES] = np.broadcast_to(
                 poses, (len(boundary), poses.shape[1])

@@ -98,22 +98,16 @@ class TaskPreprocessor:
             time = expected_time(boundary, limit, least=self.least_time)
         else:
             time = self.reaching_time(ends)[0][0]
-        n = boundary.start_q.shape[1]
-        shape = len(boundary), self._interior_points(boundary), n
         correction = self._correction(boundary, via_point, ends, time, scene)
+        # Networks that observe or correct a path take offsets, zero at first.
+        if correction is None and (self.iterated or self.scene_features is not None):
+            n, points = boundary.start_q.shape[1], self._interior_points(boundary)
+            correction = np.zeros((len(boundary), points, n))
         placed = self._placed_scene(len(boundary), obstacle_poses)
-        # Networks that correct their own path take offsets, zero at first.
-        if correction is None and self.iterated:
-            correction = np.zeros(shape)
         tasks = Tasks(boundary, start_xyz, goal_xyz, time, scene, correction, placed)
-        if self.scene_features is None:
+        if correction is None or placed is None:
             return tasks
-        return self._observed(
-            tasks,
-            lines_at_rest(
-                boundary, np.zeros(shape) if correction is None else correction
-            ),
-        )
+        return self._observed(tasks, lines_at_rest(boundary, correction))
 
     def _correction(
         self,

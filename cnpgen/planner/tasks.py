@@ -126,10 +126,8 @@ def reaching_time(robot: Robot, *, fixed_at_goal: int) -> Any:
 
     ends = ca.SX.sym("ends", (3 + fixed_at_goal) * robot.n)
     q, dq, _, goal_q, goal_dq, *_ = ca.vertsplit(ends, robot.n)
-    velocity, acceleration = (
-        ca.SX(robot.velocity_limit),
-        ca.SX(robot.acceleration_limit),
-    )
+    velocity = ca.SX(robot.velocity_limit)
+    acceleration = ca.SX(robot.acceleration_limit)
     # Distance at constant acceleration from dq to goal_dq.
     direct = (dq + goal_dq) * ca.fabs(goal_dq - dq) / (2 * acceleration)
     # On this side the joint speeds up first; mirrored, only one case remains.

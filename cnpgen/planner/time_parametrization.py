@@ -38,6 +38,7 @@ from cnpgen.planner.expressions import (
 from cnpgen.planner.time_scaling import PhaseGrid, make_phase_grid
 from cnpgen.problems.problem import Problem
 from cnpgen.robots.robot import Robot
+from cnpgen.schema.unchecked import unchecked
 from cnpgen.trajectory.spline_motion import Motion
 
 SOURCE = Path(__file__).with_name("time_parametrization.c")
@@ -125,14 +126,11 @@ class TimeParametrization(PhaseGrid):
         whose control points moved twice: they exceed the limits more between the
         phases.
         """
-        rate, violation = (
-            np.array(motion.rate, np.float64, order="C"),
-            np.empty(len(motion)),
-        )
+        rate = np.array(motion.rate, np.float64, order="C")
+        violation = np.empty(len(motion))
         self._fit(motion.path, obstacle_poses, rate, violation)
-        return Motion(
-            motion.path, rate, motion.degree
-        ), violation <= self.violation_tolerance
+        fitted = unchecked(Motion, motion.path, rate, motion.degree)
+        return fitted, violation <= self.violation_tolerance
 
     @cached_property
     def relaxed_bounds(self) -> tuple[Array, Array]:
@@ -187,12 +185,12 @@ class TimeParametrization(PhaseGrid):
         self, path: Array, obstacle_poses: Array, rate: Array, violation: Array
     ) -> None:
         """Fit rates in place, and write their largest violations; inf where control points moved twice."""
-        rows, phases = (
+        rows = (
             self.coefficients.tape.inputs[0]
             + len(self.coefficients.tape.outputs) * len(self.lower)
-            + 3,
-            self.path.shape[1],
+            + 3
         )
+        phases = self.path.shape[1]
         # One buffer for all motions: the C code allocates nothing.
         memory = np.empty(
             MAX_VECTOR_WIDTH * (1 + len(self.lower)) + rows * phases + rate.shape[1]
@@ -229,10 +227,8 @@ def make_time_parametrization(
             f"plans of {problem.name!r} cannot be time-parametrized: it bounds the power of its motors"
         )
     intervals = INTERVALS_AT_REST if at_rest else PARAMETRIZATION_INTERVALS
-    library, speeds = (
-        kernels.load_source(SOURCE),
-        make_phase_grid(problem, kernels, intervals),
-    )
+    library = kernels.load_source(SOURCE)
+    speeds = make_phase_grid(problem, kernels, intervals)
     function = library.parametrize_rates
     function.argtypes, function.restype = (c_void_p, c_long, *[c_void_p] * 5), None
     rows = (

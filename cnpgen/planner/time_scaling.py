@@ -112,9 +112,10 @@ class TimeScaling(PhaseGrid):
             # Most phases meet their limits: only the others are measured at other
             # speeds.
             violating = np.flatnonzero(violation[0] > 0)
-            columns.append(column.take(violating, axis=1))
-            motions.append(block.start + violating // phases)
-        if not any(map(len, motions)):
+            if len(violating):
+                columns.append(column.take(violating, axis=1))
+                motions.append(block.start + violating // phases)
+        if not motions:
             return factor
         np.maximum.at(
             factor,
@@ -160,11 +161,11 @@ class TimeScaling(PhaseGrid):
             scale = _smallest_scale(margin, change - quadratic, quadratic)
             cubic = self.bounds.cubic[row]
             scale[cubic] = _smallest_scale_cubic(margin[cubic], change[cubic])
-            power = self.bounds.power[row]
-            quarter = sign * slowest[row, phase][power]
-            scale[power] = _smallest_scale_of_powers(
-                margin[power], change[power], half[power], quarter
-            )
+            if (power := self.bounds.power[row]).any():
+                quarter = sign * slowest[row, phase][power]
+                scale[power] = _smallest_scale_of_powers(
+                    margin[power], change[power], half[power], quarter
+                )
             np.maximum.at(needed, phase, scale)
         return needed
 
@@ -173,10 +174,8 @@ def make_time_scaling(
     problem: Problem, robot: Robot, kernels: KernelLibrary
 ) -> TimeScaling:
     """Load the time scaling of one problem."""
-    speeds, residuals = (
-        make_phase_grid(problem, kernels, SCALING_INTERVALS),
-        kernels.load(speed_residuals),
-    )
+    speeds = make_phase_grid(problem, kernels, SCALING_INTERVALS)
+    residuals = kernels.load(speed_residuals)
     return TimeScaling(
         speeds.violation,
         speeds.path,

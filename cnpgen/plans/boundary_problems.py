@@ -11,8 +11,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from cnpgen.arrays import AnyArray, Columns, Integers
 from cnpgen.errors import DatasetError, UsageError, lacks
 from cnpgen.plans.format import (
     ATTRIBUTES,
@@ -64,7 +64,7 @@ class BoundaryFile:
 
     path: Path
     attributes: Mapping[str, Any]
-    columns: Mapping[str, NDArray[Any]]
+    columns: Mapping[str, AnyArray]
     has_checksum: bool
 
     @property
@@ -146,7 +146,7 @@ class BoundaryFile:
             check_boundary_units(robot, boundary, where=str(self.path))
         return boundary
 
-    def sample_id(self, rows: int) -> NDArray[np.int64]:
+    def sample_id(self, rows: int) -> Integers:
         """Return N sample IDs, 0, 1, ... by default.
 
         Raise DatasetError for others than integers or a shard's rows.
@@ -162,7 +162,7 @@ class BoundaryFile:
             )
         return ids.astype(np.int64)
 
-    def _has_indices(self, ids: NDArray[Any]) -> bool:
+    def _has_indices(self, ids: AnyArray) -> bool:
         """Return whether sample IDs are the indices of all rows of a shard, by its attributes."""
         first, rows = (
             self.attributes.get(name) for name in ("first_sample_id", "rows")
@@ -213,7 +213,7 @@ def read_boundary_file(path: Path) -> BoundaryFile:
     return found
 
 
-def boundary_in(where: str, columns: Mapping[str, NDArray[Any]], n: int) -> Boundary:
+def boundary_in(where: str, columns: Mapping[str, AnyArray], n: int) -> Boundary:
     """Read boundary conditions of n joints from columns; missing ones are zero, missing goal accelerations are free.
 
     Wrong shapes of columns, name -> values of shape (N, n), and values that are not
@@ -307,8 +307,8 @@ def _of_folder(folder: Path, split: str, start: int, n: int | None) -> Plans:
 
 
 def scene_columns(
-    dataset: StoredDataset, split: str, rows: range, columns: Mapping[str, NDArray[Any]]
-) -> dict[str, NDArray[Any]]:
+    dataset: StoredDataset, split: str, rows: range, columns: Mapping[str, AnyArray]
+) -> Columns:
     """Return the column with the obstacles of rows of a dataset, by ``scene_id``.
 
     None if samples have no scenes.
@@ -362,7 +362,7 @@ def _of_file(
         wanted,
         content="boundary problems",
         command="solve",
-        parameters=file.columns.get("parameters") if extrapolate else None,
+        parameters=file.columns.get("parameters", ()) if extrapolate else None,
     )
     recorded = file.text("problem_sha256")
     if recorded and recorded != problem.comparable_sha256:
@@ -387,7 +387,7 @@ def _of_file(
 
 
 def plans_of_rows(
-    problem: ProblemRecord, columns: Mapping[str, NDArray[Any]], *, source: str = ""
+    problem: ProblemRecord, columns: Mapping[str, AnyArray], *, source: str = ""
 ) -> Plans:
     """Return rows of a dataset, columns as in shards, as plans: those of a certified dataset, or of nan."""
     spec = problem.trajectory

@@ -11,6 +11,7 @@ from typing import Any, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from cnpgen.arrays import JsonObject, Mask
 from cnpgen.errors import UsageError, counted
 from cnpgen.judges.plans import Reason, Verdict, judge, summarize_verdicts
 from cnpgen.judges.plans.judge import check_step
@@ -75,7 +76,7 @@ class Evaluation:
         return html_table(repr(self), head, rows)
 
     @property
-    def valid(self) -> NDArray[np.bool_]:
+    def valid(self) -> Mask:
         """Whether each plan is valid, shape (N,)."""
         return np.array([verdict.valid for verdict in self.verdicts], bool)
 
@@ -101,7 +102,7 @@ class Evaluation:
         """Who states the limits that were judged: quantity -> source."""
         return judged_sources(*open_problem(self.plans.problem))
 
-    def summary(self) -> dict[str, Any]:
+    def summary(self) -> JsonObject:
         """Return the summary of all plans for JSON ('cnpgen docs verdict')."""
         record = self.plans.problem
         return {
@@ -123,7 +124,7 @@ class Evaluation:
             **summarize_verdicts(self.verdicts),
         }
 
-    def rows(self) -> Iterator[dict[str, Any]]:
+    def rows(self) -> Iterator[JsonObject]:
         """Yield the result of each plan for JSON ('cnpgen docs verdict')."""
         for index, (sample, verdict) in enumerate(
             zip(self.plans.sample_id.tolist(), self.verdicts, strict=True)

@@ -8,9 +8,9 @@ from dataclasses import dataclass, fields, replace
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
-from cnpgen.errors import DatasetError, RecipeError, UsageError
+from cnpgen.arrays import Array
+from cnpgen.errors import DatasetError, RecipeError, UsageError, counted
 from cnpgen.plans.exporter import ExportedSet, Exporter, SampledPlan, sample_plan
 from cnpgen.plans.format import PlanStatus
 from cnpgen.plans.join import JoinedPlans
@@ -198,9 +198,7 @@ def _write_each(
     return held
 
 
-def _environment(
-    plans: Plans | JoinedPlans, kept: list[int]
-) -> dict[str, NDArray[np.float64]]:
+def _environment(plans: Plans | JoinedPlans, kept: list[int]) -> dict[str, Array]:
     """Return goals, columns of the tasks and scenes of chosen plans, shape (N, w) each; of the last if joined."""
     last = _last(plans)
     columns = {
@@ -239,7 +237,7 @@ def _chosen(plans: Plans | JoinedPlans, only: Sequence[int] | None) -> list[int]
     for index in chosen:
         if not 0 <= index < len(plans):
             raise UsageError(
-                f"there is no plan {index}: {len(plans)} plans are numbered from 0",
+                f"there is no plan {index}: {counted(len(plans), 'plan')}, numbered from 0",
                 concerns="only",
             )
     return chosen

@@ -10,9 +10,8 @@ from pathlib import Path
 from typing import ClassVar
 
 import numpy as np
-from numpy.typing import NDArray
 
-from cnpgen.arrays import Array
+from cnpgen.arrays import Array, Integers
 from cnpgen.plans.format import UNITS
 from cnpgen.robots.parameter_ranges import PARAMETER_UNITS
 from cnpgen.trajectory.joined import JoinedMotion
@@ -74,8 +73,8 @@ class ExportedSet:
         has_drives: Whether the plans have torques at joints and motors.
     """
 
-    index: NDArray[np.int64]
-    sample_id: NDArray[np.int64]
+    index: Integers
+    sample_id: Integers
     joint_names: tuple[str, ...]
     prismatic: tuple[bool, ...]
     held_joints: dict[str, float]

@@ -11,8 +11,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from cnpgen.arrays import AnyArray, Array, Integers, JsonObject
 from cnpgen.errors import UsageError, requires_extra
 from cnpgen.plans.exporter import ExportedSet, Exporter, SampledPlan, parameter_columns
 from cnpgen.plans.format import JOINT_NAMES_KEY, PHASE_COLUMN, PLAN_COLUMN
@@ -192,8 +192,11 @@ class JointTrajectory(Exporter):
         points = ",\n    ".join(_point_text(plan, k) for k in range(len(plan.t)))
         header = json.dumps({"stamp": {"sec": 0, "nanosec": 0}, "frame_id": ""})
         names = json.dumps(exported.joint_names)
-        text = f'{{\n  "header": {header},\n  "joint_names": {names},\n  "points": [\n    {points}\n  ]\n}}\n'
-        write_file(path, text)
+        write_file(
+            path,
+            f'{{\n  "header": {header},\n  "joint_names": {names},\n  "points": [\n    {points}\n  '
+            "]\n}\n",
+        )
 
 
 @dataclass(frozen=True)
@@ -267,14 +270,14 @@ def _point_text(plan: SampledPlan, k: int, *, effort: bool = True) -> str:
     # Stamps are integers: whole seconds and the nanoseconds in them.
     sec, nanosec = divmod(round(plan.t[k] * NANOSECONDS), NANOSECONDS)
     values = {"positions": plan.q, "velocities": plan.dq, "accelerations": plan.ddq}
-    point: dict[str, Any] = {name: rows[k].tolist() for name, rows in values.items()}
+    point: JsonObject = {name: rows[k].tolist() for name, rows in values.items()}
     if effort:
         point["effort"] = []
     text = json.dumps({**point, "time_from_start": {"sec": sec, "nanosec": nanosec}})
     return _WITHOUT_POINT.sub(r"\1.0", text)
 
 
-def _add(archive: zipfile.ZipFile, name: str, values: NDArray[Any]) -> None:
+def _add(archive: zipfile.ZipFile, name: str, values: AnyArray) -> None:
     """Add an array with a fixed date, so that equal plans give equal bytes."""
     with archive.open(zipfile.ZipInfo(f"{name}.npy"), "w", force_zip64=True) as member:
         np.lib.format.write_array(member, values, allow_pickle=False)
@@ -282,7 +285,7 @@ def _add(archive: zipfile.ZipFile, name: str, values: NDArray[Any]) -> None:
 
 def _spline_columns(
     motion: Motion, exported: ExportedSet
-) -> dict[str, NDArray[np.float64] | NDArray[np.int64]]:
+) -> dict[str, Array | Integers]:
     """Return the datasets of the file."""
     from scipy.interpolate import BSpline
 
@@ -310,7 +313,7 @@ def _spline_columns(
     }
 
 
-def fixed_lists(values: NDArray[Any]) -> Any:
+def fixed_lists(values: AnyArray) -> Any:
     """Return an array of shape (K, w) as K lists of w values."""
     import pyarrow
 

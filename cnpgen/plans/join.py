@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from cnpgen.arrays import Array
-from cnpgen.errors import UsageError
+from cnpgen.arrays import Array, Integers
+from cnpgen.errors import UsageError, counted
 from cnpgen.plans.format import NOTES, PlanStatus
 from cnpgen.plans.plans import Plans, check_made
 from cnpgen.problems.problem_record import ProblemRecord
@@ -38,7 +38,7 @@ class JoinedPlans:
         return len(self.parts[0])
 
     def __repr__(self) -> str:
-        return f"<{len(self)} sequences of {len(self.parts)} plans of {self.problem.name!r}>"
+        return f"<{counted(len(self), 'sequence')} of {counted(len(self.parts), 'plan')} of {self.problem.name!r}>"
 
     @property
     def problem(self) -> ProblemRecord:
@@ -46,7 +46,7 @@ class JoinedPlans:
         return self.parts[0].problem
 
     @property
-    def sample_id(self) -> NDArray[np.int64]:
+    def sample_id(self) -> Integers:
         """Sample IDs of the first plans, shape (N,)."""
         return self.parts[0].sample_id
 

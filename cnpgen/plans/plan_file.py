@@ -14,8 +14,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
+from cnpgen.arrays import AnyArray, Columns, Integers
 from cnpgen.errors import DatasetError, RecipeError, UsageError, nearest
 from cnpgen.plans.format import (
     ATTRIBUTES,
@@ -108,7 +109,7 @@ def load_plans(
         wanted,
         content="plans",
         command="evaluate",
-        parameters=columns.get("parameters") if extrapolate else None,
+        parameters=columns.get("parameters", ()) if extrapolate else None,
     )
     with errors_of_file(path):
         plans = _assembled(path, record, columns, attributes)
@@ -122,11 +123,12 @@ def errors_of_file(path: Path) -> Iterator[None]:
         yield
     except UsageError as error:
         field = f"{error.argument} " if error.is_predicate else ""
-        text = f"{path}: {field}{error.args[0]}"
-        raise DatasetError(text, remedies=error.remedies) from error
+        raise DatasetError(
+            f"{path}: {field}{error.args[0]}", remedies=error.remedies
+        ) from error
 
 
-def _columns(path: Path, file: Hdf5) -> dict[str, NDArray[Any]]:
+def _columns(path: Path, file: Hdf5) -> Columns:
     """Read the datasets of a file."""
     columns = {name: _read(path, name, item) for name, item in file.columns().items()}
     missing = [
@@ -144,7 +146,7 @@ def _columns(path: Path, file: Hdf5) -> dict[str, NDArray[Any]]:
     return columns
 
 
-def _read(path: Path, name: str, dataset: Column) -> NDArray[Any]:
+def _read(path: Path, name: str, dataset: Column) -> AnyArray:
     """Read a dataset in its required type."""
     what, kinds = (
         ("integers", "iu")
@@ -211,7 +213,7 @@ def agreed_problem(
     *,
     content: str,
     command: str,
-    parameters: NDArray[Any] | None = None,
+    parameters: ArrayLike | None = None,
 ) -> ProblemRecord:
     """Return the problem of a file: the required one if it is consistent, or the file's own.
 
@@ -324,7 +326,7 @@ def _stored_record(path: Path, attributes: Mapping[str, Any]) -> ProblemRecord:
 def _assembled(
     path: Path,
     record: ProblemRecord,
-    columns: dict[str, NDArray[Any]],
+    columns: Columns,
     attributes: Mapping[str, Any],
 ) -> Plans:
     """Build the plans from the contents of the file."""
@@ -356,7 +358,7 @@ def _assembled(
 
 
 def _statuses(
-    path: Path, stored: NDArray[np.int64], attributes: Mapping[str, Any]
+    path: Path, stored: Integers, attributes: Mapping[str, Any]
 ) -> NDArray[np.uint8]:
     """Translate status values by their names in the file.
 
@@ -432,7 +434,7 @@ def check_replaceable(path: Path) -> None:
         )
 
 
-def _datasets(plans: Plans) -> dict[str, NDArray[Any]]:
+def _datasets(plans: Plans) -> Columns:
     """Return the stored datasets, in order and in their stored types."""
     # Columns are sorted: the order of a mapping does not change the bytes.
     floats = plans.boundary.arrays() | dict(sorted(plans.columns.items()))
@@ -441,7 +443,7 @@ def _datasets(plans: Plans) -> dict[str, NDArray[Any]]:
         "rate_control_points": plans.rate_control_points,
     }
     floats["duration"] = plans.duration
-    stored: dict[str, NDArray[Any]] = {
+    stored: Columns = {
         name: np.ascontiguousarray(values, "<f8") for name, values in floats.items()
     }
     return stored | {

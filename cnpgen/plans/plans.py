@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from cnpgen.arrays import Array
+from cnpgen.arrays import AnyArray, Array, Integers, NamedErrors
 from cnpgen.errors import UsageError, counted
 from cnpgen.plans.format import FLOATS, INTEGERS, NOTES, PlanStatus
 from cnpgen.plans.plausible import check_boundary_units
@@ -62,7 +62,7 @@ class Plans:
     rate_control_points: Array
     degree: int
     columns: Mapping[str, Array] = field(default_factory=dict)
-    sample_id: NDArray[np.int64]
+    sample_id: Integers
     status: NDArray[np.uint8]
     source: str = ""
     refined_with: str = ""
@@ -172,7 +172,7 @@ class Plans:
             )
         return states_at_times(self.motion, times)
 
-    def __getitem__(self, which: int | slice | Sequence[int] | NDArray[Any]) -> Plans:
+    def __getitem__(self, which: int | slice | Sequence[int] | AnyArray) -> Plans:
         """Return a selection of the plans, as Plans also for a single plan.
 
         Args:
@@ -319,9 +319,7 @@ def screen(plans: Plans) -> NDArray[np.uint8]:
     return np.where(finite, found, PlanStatus.NOT_FINITE).astype(np.uint8)
 
 
-def _integers(
-    name: str, values: ArrayLike, kind: type[np.integer[Any]]
-) -> NDArray[Any]:
+def _integers(name: str, values: ArrayLike, kind: type[np.integer[Any]]) -> AnyArray:
     """Return values as an integer array of a type; raise an error for other values."""
     try:
         reject_masked(name, values)
@@ -345,7 +343,7 @@ def _integers(
     return whole
 
 
-def _checked(which: Any, plans: int) -> slice | NDArray[Any]:
+def _checked(which: Any, plans: int) -> slice | AnyArray:
     """Return a selection of plans as a slice or an index array of shape (k,)."""
     if isinstance(which, slice):
         return which
@@ -379,13 +377,13 @@ def _checked(which: Any, plans: int) -> slice | NDArray[Any]:
     elif found.size and not -plans <= int(found.min()) <= int(found.max()) < plans:
         wrong = int(found.max() if found.max() >= plans else found.min())
         raise PlanIndexError(
-            f"there is no plan {wrong}: {plans} plans are numbered from 0",
+            f"there is no plan {wrong}: {counted(plans, 'plan')}, numbered from 0",
             concerns="which",
         )
     return np.atleast_1d(found)
 
 
-def _errors(plans: Plans, rows: int | None = None) -> Iterator[tuple[str, str]]:
+def _errors(plans: Plans, rows: int | None = None) -> NamedErrors:
     """Yield the argument and the message of every error in shapes.
 
     The default number of plans is that of the paths.
@@ -419,7 +417,7 @@ def _errors(plans: Plans, rows: int | None = None) -> Iterator[tuple[str, str]]:
             yield name, f"{name} must be a text, got {getattr(plans, name)!r:.60}"
 
 
-def _spline_errors(plans: Plans, rows: int) -> Iterator[tuple[str, str]]:
+def _spline_errors(plans: Plans, rows: int) -> NamedErrors:
     path = plans.path_control_points
     rate = plans.rate_control_points
     degree = plans.degree
@@ -456,7 +454,7 @@ def _spline_errors(plans: Plans, rows: int) -> Iterator[tuple[str, str]]:
         )
 
 
-def _parameter_errors(plans: Plans, rows: int) -> Iterator[tuple[str, str]]:
+def _parameter_errors(plans: Plans, rows: int) -> NamedErrors:
     parameters = plans.boundary.parameters
     width = len(plans.problem.parameters)
     if width and parameters is None:
@@ -478,7 +476,7 @@ def _parameter_errors(plans: Plans, rows: int) -> Iterator[tuple[str, str]]:
 
 def _rows(plans: Plans) -> int:
     """Return the most frequent number of plans among the fields."""
-    fields: list[NDArray[Any]] = [*plans.boundary.arrays().values()]
+    fields: list[AnyArray] = [*plans.boundary.arrays().values()]
     fields += [
         plans.path_control_points,
         plans.rate_control_points,
@@ -493,7 +491,7 @@ def _rows(plans: Plans) -> int:
     ).most_common(1)[0][0]
 
 
-def _column_errors(plans: Plans, rows: int) -> Iterator[tuple[str, str]]:
+def _column_errors(plans: Plans, rows: int) -> NamedErrors:
     for name, values in plans.columns.items():
         array: Any = values
         if not isinstance(array, np.ndarray):

@@ -3,11 +3,10 @@
 import inspect
 import warnings
 from collections.abc import Mapping, Sequence
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from cnpgen.arrays import AnyArray
 from cnpgen.plans.format import UNITS
 from cnpgen.robots.plausible_values import UnitError, check_plausible
 from cnpgen.robots.robot import Robot
@@ -31,11 +30,8 @@ def check_boundary_units(
     Raises:
         UnitError: A value is probably in another unit.
     """
-    columns = {
-        name: np.asarray(values) for name, values in boundary.conditions().items()
-    }
     try:
-        check_units_of_states(robot, columns, noun="plan")
+        check_units_of_states(robot, boundary.conditions(), noun="plan")
     except UnitError as error:
         text = f"{where}: {error}" if where else str(error)
         if allow_large_angles:
@@ -49,7 +45,7 @@ def check_boundary_units(
 
 
 def check_units_of_states(
-    robot: Robot, columns: Mapping[str, NDArray[Any]], *, noun: str
+    robot: Robot, columns: Mapping[str, AnyArray], *, noun: str
 ) -> None:
     """Raise UnitError for columns such as ``start_dq``, shape (N, n) each, that are probably in another unit."""
     if not _are_usual(robot, list(columns.values())):
@@ -57,7 +53,7 @@ def check_units_of_states(
         check_plausible(robot, columns, units, noun=noun)
 
 
-def _are_usual(robot: Robot, states: Sequence[NDArray[Any]]) -> bool:
+def _are_usual(robot: Robot, states: Sequence[AnyArray]) -> bool:
     """Return whether states are within the limits of the joints: a fast check.
 
     The states are positions, velocities and accelerations of one state, or of two

@@ -98,8 +98,9 @@ def scene_plans(
         goals = [goal_states(scene, robot)[0] for scene in scenes]
     goal_q = numbers("goals", goals)
     if goal_q.shape != start.shape:
-        text = f"must have shape {start.shape}, got {goal_q.shape}"
-        raise UsageError(text, argument="goals")
+        raise UsageError(
+            f"must have shape {start.shape}, got {goal_q.shape}", argument="goals"
+        )
     zero, spec, count = np.zeros_like(start), problem.trajectory, len(scenes)
     fixed = len(problem.obstacle)
     ids = None if sample_id is None else numbers("sample_id", sample_id, "int64")
@@ -260,8 +261,10 @@ def poses_of_scene(problem: Problem, fixed: int, scene: SceneProblem) -> Array:
         free.setdefault(shape_of(obstacle), []).append(index)
     for obstacle in scene.obstacles:
         if not free.get(shape_of(obstacle)):
-            text = f"{scene.place} has more obstacles of the kind {obstacle.kind} than the capacity"
-            raise UsageError(text, concerns="capacity")
+            raise UsageError(
+                f"{scene.place} has more obstacles of the kind {obstacle.kind} than the capacity",
+                concerns="capacity",
+            )
         # The first free place of the shape: places that remain stay parked.
         own = place_obstacles([obstacle])
         part = slices[free[shape_of(obstacle)].pop(0)]

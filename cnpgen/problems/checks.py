@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree
 
+from cnpgen.arrays import JsonObject
 from cnpgen.errors import PluginError, RecipeError, listed, nearest
 from cnpgen.problems.constraints.constraint import Constraint
 from cnpgen.problems.constraints.link_clearance import ObjectClearance
@@ -38,12 +39,12 @@ class ProblemTables:
     The URDF is read once.
     """
 
-    table: dict[str, Any]
+    table: JsonObject
     where: RecipeLocation
     folder: Path
 
     @cached_property
-    def robot(self) -> dict[str, Any]:
+    def robot(self) -> JsonObject:
         """The table [robot]; empty if there is none."""
         robot = self.table.get("robot")
         return robot if isinstance(robot, dict) else {}
@@ -99,7 +100,7 @@ class ProblemTables:
             "urdf" if something_to_hit and self.collision_elements else "paper-capsules"
         )
 
-    def constraints(self, use: str) -> list[tuple[int, dict[str, Any]]]:
+    def constraints(self, use: str) -> list[tuple[int, JsonObject]]:
         """Return the tables of the constraints of a kind, with their indices."""
         return [
             (place, each)
@@ -139,8 +140,10 @@ def problem_errors(raw: ProblemTables) -> Iterator[str]:
     for index, obstacle in tables(table, "obstacle"):
         if index == 0 and uses <= BUILT_IN[CONSTRAINTS].keys() - using:
             # Plug-ins may use them.
-            text = 'no constraint uses it: add a [[constraint]] with use = "robot-clearance" and a tolerance'
-            yield (where / "obstacle" / index).message(text)
+            yield (where / "obstacle" / index).message(
+                'no constraint uses it: add a [[constraint]] with use = "robot-clearance" and a '
+                "tolerance"
+            )
         if obstacle.get("below") and "object" not in table:
             yield (where / "obstacle" / index / "below").message(
                 "nothing stands on the obstacle: there is no [object]"
@@ -387,12 +390,14 @@ def _repeated(raw: ProblemTables, array: str, key: str) -> Iterator[str]:
         name = entry if "link" in entry else entry.get(key)
         if key in entry and name in seen:
             article = "an" if array[0] in "aeiou" else "a"
-            text = f"there is {article} {array} {show(entry[key])} already: edit that one, or remove one of them"
-            yield (raw.where / array / index / key).message(text)
+            yield (raw.where / array / index / key).message(
+                f"there is {article} {array} {show(entry[key])} already: edit that one, or remove one "
+                "of them"
+            )
         seen.append(name)
 
 
-def tables(table: dict[str, Any], array: str) -> list[tuple[int, dict[str, Any]]]:
+def tables(table: JsonObject, array: str) -> list[tuple[int, JsonObject]]:
     """Return the tables among the entries of an array, with their indices."""
     entries = table.get(array)
     return (

@@ -62,7 +62,8 @@ def limit_sources(problem: Problem, robot: Robot) -> dict[str, LimitSource]:
     """
     limits, drive = problem.limits, problem.drive
     stated = limits.sources or LimitSources()
-    urdf, numbers = LimitSource("urdf"), LimitSource(NOT_STATED)
+    urdf = LimitSource("urdf")
+    numbers = LimitSource(NOT_STATED)
     # Without a stated source, the origin of the numbers decides.
     origins: dict[str, Callable[[], LimitSource]] = {
         "position": lambda: numbers if limits.position else urdf,

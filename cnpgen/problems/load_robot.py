@@ -52,7 +52,8 @@ def load_robot(problem: Problem) -> Robot:
     """
     spec, limits = problem.robot, problem.limits
     with recipe_errors_in(problem.path):
-        urdf, attached = problem.urdf_text, _attached(problem)
+        urdf = problem.urdf_text
+        attached = _attached(problem)
         model, joints = read_model(problem.urdf_path, urdf, spec.joints, attached)
         chain = chain_from_model(model, attached.tip)
         rated = _given(limits.velocity, "velocity", model.velocityLimit)

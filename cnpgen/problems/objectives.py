@@ -7,10 +7,10 @@ packages, as constraints do.
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, ClassVar
 
+from cnpgen.arrays import NamedErrors
 from cnpgen.errors import RecipeError, UsageError, nearest
 from cnpgen.schema import registry
 from cnpgen.schema.arguments import concerning
@@ -155,7 +155,7 @@ class TipReference(ObjectiveTerm):
         "corners of the curve, a polyline in the world frame", unit="m"
     )
 
-    def validate(self) -> Iterator[tuple[str, str]]:
+    def validate(self) -> NamedErrors:
         """Yield (key, error) pairs."""
         if len(self.points) < 2 or any(len(point) != 3 for point in self.points):
             yield "points", "expected at least 2 points of 3 coordinates each"

@@ -3,7 +3,7 @@
 import dataclasses
 import hashlib
 import json
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import cached_property
@@ -11,8 +11,8 @@ from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
 
+from cnpgen.arrays import Array, JsonMapping, JsonObject, NamedErrors, Vector3
 from cnpgen.errors import MachineError, UsageError
 from cnpgen.problems.constraints.axis import TipAxis
 from cnpgen.problems.constraints.clearance import ObjectContact, RobotClearance
@@ -203,7 +203,7 @@ class Problem:
         clearance = self.first(RobotClearance)
         return None if clearance is None else clearance.radius
 
-    def validate(self) -> Iterator[tuple[str, str]]:
+    def validate(self) -> NamedErrors:
         """Yield (key, error) pairs."""
         for key in ("obstacle", "constraint"):
             if (count := len(getattr(self, key))) > MAX_TABLES:
@@ -238,7 +238,7 @@ class Problem:
 
         yield from self._parameter_errors()
 
-    def _parameter_errors(self) -> Iterator[tuple[str, str]]:
+    def _parameter_errors(self) -> NamedErrors:
         if self.parameters.changes_payload and self.payload is None:
             (name, *_) = (
                 name for name in self.parameters.names if name in PAYLOAD_PARAMETERS
@@ -278,7 +278,7 @@ class Problem:
         if self.parameters.tilts_table or self.parameters.changes_rectangle:
             yield from self._table_errors()
 
-    def _table_errors(self) -> Iterator[tuple[str, str]]:
+    def _table_errors(self) -> NamedErrors:
         tables = [
             constraint
             for constraint in self.constraint
@@ -308,13 +308,13 @@ class Problem:
             )
 
     @property
-    def object_size(self) -> tuple[float, float, float] | None:
+    def object_size(self) -> Vector3 | None:
         """Edge lengths of the held object [m], None if nothing is held."""
         # The code of a plug-in may use names, poses and sizes as constants.
         return None if self.object is None else self.object.size
 
     @property
-    def nominal_parameters(self) -> NDArray[np.float64]:
+    def nominal_parameters(self) -> Array:
         """Parameters of a sample for which none are given, shape (width,)."""
         values: dict[str, float] = {}
         if (payload := self.payload) is not None:
@@ -330,7 +330,7 @@ class Problem:
         return self.parameters.nominal(values)
 
     @property
-    def table_origin(self) -> NDArray[np.float64]:
+    def table_origin(self) -> Array:
         """Center of the rectangle of the table, about which it turns [m], shape (3,).
 
         Zero without a table.
@@ -449,7 +449,9 @@ class Problem:
         )
         if spec.srdf:
             srdf = self.path.parent / spec.srdf
-            text = with_disabled_pairs(text, srdf, allow_unused=spec.allow_unused)
+            text = with_disabled_pairs(
+                text, srdf, planned=spec.joints, allow_unused=spec.allow_unused
+            )
         return self._with_payload(text)
 
     def _with_payload(self, text: str) -> str:
@@ -500,7 +502,7 @@ class Problem:
         ).hexdigest()
 
 
-def _structure_of(obstacle: Mapping[str, Any]) -> dict[str, Any]:
+def _structure_of(obstacle: JsonMapping) -> JsonObject:
     """Return the keys of a resolved obstacle that kernels contain as constants: all but name, pose and sizes."""
     # Kernels contain the ranges of an obstacle as constants.
     if obstacle.get("x") is not None or obstacle.get("y") is not None:
@@ -541,7 +543,7 @@ def kept_folder() -> Path | None:
     return None if trust_problem(folder) else folder
 
 
-def resolved(recipe: object) -> dict[str, Any]:
+def resolved(recipe: object) -> JsonObject:
     """Return a problem, pipeline or dataset recipe as plain dicts and lists in SI units.
 
     The result includes referenced recipes and default values.
@@ -574,7 +576,7 @@ def _all_of(obj: object) -> dict[str, str]:
     return label | {spec.name: repr(getattr(obj, spec.name)) for spec in others}
 
 
-def without_labels(problem: Mapping[str, Any]) -> dict[str, Any]:
+def without_labels(problem: JsonMapping) -> JsonObject:
     """Remove title, version, file names and sources of limits from a resolved problem: they do not affect its motions."""
     robot = {key: value for key, value in problem["robot"].items() if key not in FILES}
     labels = {"title", "version"}
@@ -582,6 +584,6 @@ def without_labels(problem: Mapping[str, Any]) -> dict[str, Any]:
     return kept | {"robot": robot, "limits": without_sources(problem["limits"])}
 
 
-def without_sources(limits: Mapping[str, Any]) -> dict[str, Any]:
+def without_sources(limits: JsonMapping) -> JsonObject:
     """Remove the sources from resolved limits."""
     return {key: value for key, value in limits.items() if key != SOURCES}

@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from cnpgen.arrays import JsonObject
 from cnpgen.errors import PluginError, RecipeError
 from cnpgen.problems.checks import ProblemTables, limit_errors, problem_errors, tables
 from cnpgen.problems.constraints.constraint import Constraint
@@ -111,8 +112,11 @@ def read_problem(path: Path, errors: list[str]) -> Problem | None:
             errors.append(f"{path}: drive.urdf_dynamics: missing; {undecided}")
         # Files of version 1 ignored friction silently: an error would reject them.
         elif undecided:
-            message = f"{path}: friction of the URDF is ignored; {undecided}"
-            warnings.warn(message, UserWarning, stacklevel=3)
+            warnings.warn(
+                f"{path}: friction of the URDF is ignored; {undecided}",
+                UserWarning,
+                stacklevel=3,
+            )
     spec = replace(problem.robot, geometry=raw.geometry)
     constraints = raw.with_object_clearance(problem)
     return replace(
@@ -180,7 +184,7 @@ def names_of_stored_files(folder: Path) -> Iterator[None]:
         raise RecipeError(errors) from error
 
 
-def restore_problem(content: dict[str, Any], urdf: str, folder: Path) -> Problem:
+def restore_problem(content: JsonObject, urdf: str, folder: Path) -> Problem:
     """Rebuild a problem from its resolved form and the text of its URDF, for whose file there is a folder."""
     if missing := missing_kinds_of_problem(content):
         raise PluginError(missing)
@@ -238,7 +242,7 @@ def _meshes_on_disk(
             )
 
 
-def missing_kinds_of_problem(content: dict[str, Any]) -> list[str]:
+def missing_kinds_of_problem(content: JsonObject) -> list[str]:
     """Return the missing packages of the constraints and objective terms of a resolved problem."""
     objective = content.get("objective")
     terms = tables(objective, "term") if isinstance(objective, dict) else []
@@ -248,7 +252,7 @@ def missing_kinds_of_problem(content: dict[str, Any]) -> list[str]:
     ]
 
 
-def missing_kinds(group: str, entries: list[tuple[int, dict[str, Any]]]) -> list[str]:
+def missing_kinds(group: str, entries: list[tuple[int, JsonObject]]) -> list[str]:
     """Return the missing packages of resolved stage or constraint tables."""
     found = (
         registry.why_missing(group, str(each.get("use")), str(each.get("package", "")))

@@ -15,8 +15,8 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 from numpy.typing import ArrayLike
 
-from cnpgen.arrays import Array
-from cnpgen.errors import RecipeError, UsageError
+from cnpgen.arrays import Array, JsonObject
+from cnpgen.errors import RecipeError, UsageError, counted
 from cnpgen.problems.objectives import read_objective
 from cnpgen.problems.problem import (
     FILES,
@@ -88,17 +88,17 @@ class ProblemRecord(StoredProblem):
                 raise UsageError(f"must be a text, got {text!r:.60}", argument=name)
 
     def __repr__(self) -> str:
-        return f"<ProblemRecord of {self.name!r}: {len(self.joint_names)} joints>"
+        return f"<ProblemRecord of {self.name!r}: {counted(len(self.joint_names), 'joint')}>"
 
     @cached_property
-    def content(self) -> dict[str, Any]:
+    def content(self) -> JsonObject:
         """The resolved problem, as ``cnpgen.problems.problem.resolved`` returns it.
 
         Raises:
             RecipeError: The text is not the JSON of a problem.
         """
         try:
-            content: dict[str, Any] = parse_json(self.recipe)
+            content: JsonObject = parse_json(self.recipe)
             check_structure(content, _FORM)
         except ValueError as error:
             raise RecipeError(
@@ -212,7 +212,8 @@ class ProblemRecord(StoredProblem):
         Returns:
             Tip positions in the world frame [m], shape (N, 3).
         """
-        (_, robot), q = open_problem(self), numbers("q", q)
+        _, robot = open_problem(self)
+        q = numbers("q", q)
         if q.ndim != 2 or q.shape[1] != robot.n:
             raise UsageError(
                 f"must have shape (N, {robot.n}), got {q.shape}", argument="q"
@@ -284,11 +285,14 @@ def extrapolated(problem: Problem, parameters: ArrayLike) -> Problem:
     """Return a problem whose ranges contain values of its parameters, shape (N, p), with a name that marks it.
 
     A problem whose ranges contain them already is returned unchanged. UsageError is
-    raised for values that no range may contain.
+    raised for values that no range may contain, and for a problem without parameters.
     """
     ranges = problem.parameters
+    if not len(ranges):
+        text = f"has no effect: the problem {problem.name!r} has no parameters"
+        raise UsageError(text, argument="extrapolate")
     rows = numbers("parameters", parameters)
-    if not len(ranges) or rows.ndim not in {1, 2} or rows.shape[-1] != len(ranges):
+    if rows.ndim not in {1, 2} or rows.shape[-1] != len(ranges):
         # Errors of the shape are those of the reader.
         return problem
     wider = ranges.widened(rows.reshape(-1, len(ranges)))
@@ -380,7 +384,7 @@ def _robot_of(record: ProblemRecord) -> Robot:
         return load_robot(problem)
 
 
-def _comparable(record: ProblemRecord) -> dict[str, Any]:
+def _comparable(record: ProblemRecord) -> JsonObject:
     """Reduce a resolved problem to the part that problems with comparable plans share."""
     kept = {
         key: value
@@ -394,7 +398,7 @@ def _comparable(record: ProblemRecord) -> dict[str, Any]:
     }
     # A difference of the URDF is one key, not the text.
     robot["urdf"] = hashlib.sha256(record.urdf.encode()).hexdigest()
-    constraints: dict[str, Any] = {}
+    constraints: JsonObject = {}
     counts = Counter[str]()
     for kind in kept["constraint"]:
         # Constraints of one kind are numbered in the order of the file.

@@ -5,14 +5,13 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from typing import TYPE_CHECKING
 
-import numpy as np
-from numpy.typing import NDArray
-
+from cnpgen.arrays import Array
+from cnpgen.problems.constraints.constraint import Conditions
 from cnpgen.schema import registry
 
 if TYPE_CHECKING:
     from cnpgen.kernels.symbolic.symbolic_state import SymbolicState
-    from cnpgen.problems.constraints.constraint import Condition, Constraint
+    from cnpgen.problems.constraints.constraint import Constraint
     from cnpgen.problems.problem import Problem
     from cnpgen.world.path import PathWorld
 
@@ -28,8 +27,8 @@ class PublishedRules(ABC):
         self,
         problem: Problem,
         world: PathWorld,
-        obstacle_poses: NDArray[np.float64],
-        goal_xyz: NDArray[np.float64],
+        obstacle_poses: Array,
+        goal_xyz: Array,
     ) -> tuple[bool, tuple[str, ...]]:
         """Judge one motion whose samples the world has.
 
@@ -45,9 +44,7 @@ class PublishedRules(ABC):
         """
 
     @abstractmethod
-    def conditions(
-        self, constraint: Constraint, state: SymbolicState
-    ) -> tuple[Condition, ...]:
+    def conditions(self, constraint: Constraint, state: SymbolicState) -> Conditions:
         """Return the conditions of a constraint that the loss of the publication penalizes."""
 
 

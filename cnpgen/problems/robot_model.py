@@ -7,10 +7,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-from cnpgen.arrays import Array
-from cnpgen.errors import UsageError
+from cnpgen.arrays import Array, Mask
+from cnpgen.errors import UsageError, counted
 from cnpgen.problems.load_robot import load_robot
 from cnpgen.problems.problem import Problem
 from cnpgen.problems.problem_record import as_problem
@@ -67,7 +67,7 @@ class ConstraintValues:
         return np.maximum(np.maximum(self.lower - self.g, self.g - self.upper), 0.0)
 
     @property
-    def valid(self) -> NDArray[np.bool_]:
+    def valid(self) -> Mask:
         """Whether each state satisfies every condition up to its tolerance, shape (N,)."""
         return np.asarray((self.violation <= self.tolerance).all(axis=1))
 
@@ -136,7 +136,7 @@ class RobotModel:
         self._world: World | None = None
 
     def __repr__(self) -> str:
-        return f"<RobotModel of {self.problem.name!r}: {len(self.joint_names)} joints, tip {self.tip!r}>"
+        return f"<RobotModel of {self.problem.name!r}: {counted(len(self.joint_names), 'joint')}, tip {self.tip!r}>"
 
     @checked_arguments
     def forward_kinematics(self, q: ArrayLike) -> tuple[Array, Array]:
@@ -312,9 +312,7 @@ class RobotModel:
         )
 
     @checked_arguments
-    def is_collision_free(
-        self, q: ArrayLike, *, scene: Scene | None = None
-    ) -> NDArray[np.bool_]:
+    def is_collision_free(self, q: ArrayLike, *, scene: Scene | None = None) -> Mask:
         """Return whether nothing penetrates at each state, shape (N,).
 
         Arguments as of ``min_distance``.

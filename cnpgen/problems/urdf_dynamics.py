@@ -81,7 +81,7 @@ def joint_notes(
     yield from _controller_notes(tree, joints, soft=soft)
     for rate in ("acceleration", "jerk"):
         if given := [each.name for each in joints if rate in each.rates]:
-            yield f"the URDF limits the {rate} of {', '.join(given)}; [limits] replaces it"
+            yield f"the URDF limits the {rate} of {', '.join(given)}; a value in [limits] replaces it"
     # A reflected inertia J = ratio^2 * J_rotor needs both factors.
     reduced = {
         joint.get("name", "")

@@ -4,9 +4,8 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-from cnpgen.arrays import Array
+from cnpgen.arrays import Array, Mask
 from cnpgen.problems.problem import Problem
 from cnpgen.refine.solver.bounds import NO_TIGHTENING, bounds_template
 from cnpgen.refine.solver.grid import make_grid
@@ -18,7 +17,6 @@ from cnpgen.refine.solver.transcription import (
 from cnpgen.refine.task import RefinementTask
 from cnpgen.world.world import World
 
-Mask = NDArray[np.bool_]
 FINE_POINTS = 600
 PENETRATION_SCALE_M = 1e-4  # of violated distances without a tolerance of their own
 # Of one motion, each by the factor that its largest violation requires.

@@ -59,7 +59,7 @@ def objective_values(plans: Plans, objective: str = "time") -> dict[str, Array]:
     first = 0
     for count, term in zip(counts, cost_term.terms, strict=True):
         # The integral over time is that over the phase, ds / r.
-        size, _ = CostTerm((replace(term, weight=1.0),)).rate(
+        size = CostTerm((replace(term, weight=1.0),)).rate(
             e[first : first + count], [count]
         )
         name = registry.name_of(registry.OBJECTIVES, type(term))

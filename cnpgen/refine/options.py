@@ -1,13 +1,19 @@
 """Options of the refiner."""
 
 from dataclasses import asdict, dataclass
-from typing import Any
 
+from cnpgen.arrays import JsonObject
 from cnpgen.errors import UsageError
 from cnpgen.problems.objectives import read_objective
 from cnpgen.refine.solver.sqp import DEFAULT_SETTINGS
 from cnpgen.schema.argument_types import check_fields
-from cnpgen.schema.arguments import check_range, integer, number
+from cnpgen.schema.arguments import (
+    check_range,
+    integer,
+    not_negative,
+    number,
+    positive,
+)
 
 MAX_STAY_WITHIN = 1.0  # rad or m
 
@@ -51,34 +57,30 @@ class RefineOptions:
     def __post_init__(self) -> None:
         check_fields(self)
         read_objective(self.objective)
-        if self.weight is not None and number("weight", self.weight) < 0:
-            raise UsageError(
-                f"must not be negative, got {self.weight}", argument="weight"
-            )
-        if self.weight is not None and "=" in self.objective:
-            text = f"must be None: the objective {self.objective!r} has weights"
-            raise UsageError(text, argument="weight")
+        if self.weight is not None:
+            not_negative("weight", self.weight)
+            if "=" in self.objective:
+                raise UsageError(
+                    f"must be None: the objective {self.objective!r} has weights",
+                    argument="weight",
+                )
         integer("max_iterations", self.max_iterations, least=0)
         if not 0 < number("tolerance", self.tolerance) < 1:
             raise UsageError(
                 f"must be above 0 and below 1, got {self.tolerance}",
                 argument="tolerance",
             )
-        if self.deadline is not None and number("deadline", self.deadline) <= 0:
-            raise UsageError(
-                f"must be above 0 s, got {self.deadline}", argument="deadline"
-            )
-        if (
-            self.stay_within is not None
-            and number("stay_within", self.stay_within) <= 0
-        ):
-            raise UsageError(
-                f"must be above 0, got {self.stay_within}", argument="stay_within"
-            )
-        if self.time_limit is not None and number("time_limit", self.time_limit) < 0:
-            raise UsageError(
-                f"must not be negative, got {self.time_limit}", argument="time_limit"
-            )
+        if self.deadline is not None:
+            positive("deadline", self.deadline, "s")
+        if self.stay_within is not None:
+            positive("stay_within", self.stay_within)
+        if self.time_limit is not None:
+            not_negative("time_limit", self.time_limit)
+        self._check_combinations()
+        check_range("stay_within", self.stay_within or 0.0, 0.0, MAX_STAY_WITHIN, "rad")
+
+    def _check_combinations(self) -> None:
+        """Raise UsageError for values that exclude each other, or that have no effect."""
         if self.time_limit is not None and self.deadline is not None:
             raise UsageError(
                 "a time limit ends the search with a valid plan, a deadline in any case: choose one",
@@ -87,11 +89,12 @@ class RefineOptions:
         usual = {"tolerance": DEFAULT_SETTINGS.cost_tolerance}
         for name in ("tolerance", "deadline", "stay_within"):
             if not self.max_iterations and getattr(self, name) != usual.get(name):
-                text = "has no effect with 0 iterations, which only scale plans in time"
-                raise UsageError(text, argument=name)
-        check_range("stay_within", self.stay_within or 0.0, 0.0, MAX_STAY_WITHIN, "rad")
+                raise UsageError(
+                    "has no effect with 0 iterations, which only scale plans in time",
+                    argument=name,
+                )
 
-    def document(self) -> dict[str, Any]:
+    def document(self) -> JsonObject:
         """Return the options for JSON, without a deadline, a distance or a limit of None."""
         optional = {"deadline", "stay_within", "time_limit"}
         return {

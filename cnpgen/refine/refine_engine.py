@@ -6,9 +6,8 @@ from functools import lru_cache
 from threading import get_ident
 
 import numpy as np
-from numpy.typing import NDArray
 
-from cnpgen.arrays import Array
+from cnpgen.arrays import Array, Mask
 from cnpgen.kernels.library import KernelLibrary
 from cnpgen.plans.plans import Plans
 from cnpgen.problems.obstacles import goal_velocities, scene_of
@@ -28,7 +27,7 @@ from cnpgen.trajectory.remaining_trajectory import is_finer
 from cnpgen.trajectory.spline_motion import Motion
 from cnpgen.trajectory.trajectory_spec import TrajectorySpec
 
-Solver = Callable[..., tuple[Motion, NDArray[np.bool_]]]  # of ``load_solver``
+Solver = Callable[..., tuple[Motion, Mask]]  # of ``load_solver``
 
 
 def refine_serially(plans: Plans, options: RefineOptions) -> list[Attempt]:
@@ -103,7 +102,7 @@ def load_solver(problem: Problem, robot: Robot, kernels: KernelLibrary) -> Solve
 
     def solve(
         columns: Mapping[str, Array], initial_guess: Motion | None = None
-    ) -> tuple[Motion, NDArray[np.bool_]]:
+    ) -> tuple[Motion, Mask]:
         ends = columns["start_xyz"], columns["goal_xyz"]
         boundary = Boundary.from_batch(columns, None)
         velocity = goal_velocities(problem, robot, boundary.goal_q, boundary.goal_dq)

@@ -217,7 +217,8 @@ def _refine(
 
     Return the row of each result, the results and the CPU time [s].
     """
-    (part, plans), begun = task, time.thread_time()
+    part, plans = task
+    begun = time.thread_time()
     rows = np.concatenate(part)
     places = iter(range(len(plans)))
     # Their places among the plans that were sent.

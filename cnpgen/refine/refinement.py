@@ -5,11 +5,10 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from cnpgen.arrays import Array, JsonObject, Mask
 from cnpgen.errors import counted
 from cnpgen.machine.times import NO_TIME, Times
 from cnpgen.plans.plans import Plans
@@ -44,12 +43,12 @@ class Refinement:
         return f"<{plans} refined, {int(self.valid.sum()):,} valid{counts and ': '}{counts}>"
 
     @property
-    def valid(self) -> NDArray[np.bool_]:
+    def valid(self) -> Mask:
         """Mask of the plans that the independent verdict accepts, shape (N,)."""
         return np.array([result.valid for result in self.results], bool)
 
     @property
-    def deviation(self) -> NDArray[np.float64]:
+    def deviation(self) -> Array:
         """Largest difference of a joint from the input path at the same phase [rad], nan without one, shape (N,)."""
         s = np.linspace(0, 1, DISTANCE_PHASES)
         pairs = zip(
@@ -63,7 +62,7 @@ class Refinement:
         ]
         return np.array([np.abs(path).max() for path in paths])
 
-    def summary(self) -> dict[str, Any]:
+    def summary(self) -> JsonObject:
         """Return a summary of all plans for JSON."""
         durations = self.plans.duration[self.valid]
         iterations = [result.iterations for result in self.results]

@@ -5,11 +5,10 @@ import json
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from cnpgen.arrays import Columns
 from cnpgen.errors import DatasetError, UsageError, counted
 from cnpgen.refine.task import Attempt, Outcome
 from cnpgen.store.files.archives import read_arrays
@@ -118,7 +117,7 @@ def _changed(old: bytes, new: str) -> list[str]:
 
 
 def _pack(indices: Sequence[int], results: Sequence[Attempt]) -> bytes:
-    arrays: dict[str, NDArray[Any]] = {
+    arrays: Columns = {
         "path": np.stack([result.path for result in results]),
         "rate": np.stack([result.rate for result in results]),
         "cost": np.array([result.cost for result in results]),

@@ -37,6 +37,7 @@ from cnpgen.refine.solver.hull_levels import (
 )
 from cnpgen.refine.solver.hulls import Hulls, has_clearance_constraints
 from cnpgen.refine.solver.residuals import (
+    CostTerm,
     choose_cost_term,
     cost_term_residuals,
     residual_counts,
@@ -89,20 +90,22 @@ class Refiner:
         levels: GridLevels | None = None,
         coarser: "Refiner | None" = None,
     ) -> None:
-        self.problem, self.robot, self.coarser = problem, robot, coarser
+        self.problem = problem
+        self.robot = robot
+        self.coarser = coarser
         self.spec = problem.trajectory if spec is None else spec
         self.settings = Settings(
             cost_tolerance=options.tolerance, max_iterations=options.max_iterations
         )
-        cost_term = choose_cost_term(problem, options.objective, options.weight)
         if kernels is None:
             kernels = problem_kernels(problem, robot, *choose_backend(None))
-        world = World(robot, problem.obstacle, problem.object_size)
+        self._world = World(robot, problem.obstacle, problem.object_size)
         # The hulls of each thread.
-        self._hulls, solved = dict[int, Hulls](), problem
-        self.measures_hulls = can_measure_hulls(problem, robot, world)
+        self._hulls = dict[int, Hulls]()
+        self.measures_hulls = can_measure_hulls(problem, robot, self._world)
         if self.measures_hulls or has_clearance_constraints(problem, robot):
             self._library = load_collision_library(kernels)
+        solved = problem
         if self.measures_hulls:
             # Distances become rows of the compiled hulls: the symbolic kernels do not
             # contain them.
@@ -110,30 +113,18 @@ class Refiner:
             kernels = problem_kernels(
                 solved, robot, kernels.backend, kernels.cache_folder
             )
-        self._kernel_poses = slice(
-            pose_width(problem.obstacle) - pose_width(solved.obstacle), None
-        )
-        self.residual_kernels = ResidualKernels(
-            self.spec,
-            kernels.load_by_structure(stage_values),
-            kernels.load_by_structure(stage_jacobian),
-            load_step_library(kernels),
-            cost_term,
-            None
-            if cost_term is None
-            else kernels.load_by_structure(cost_term_residuals, terms=cost_term.tables),
-            () if cost_term is None else residual_counts(robot, cost_term),
-        )
-        self.levels = (
-            default_grid_levels(problem, self.settings) if levels is None else levels
-        )
-        if self.measures_hulls and levels is None:
-            # Trees avoid the hulls, so that their paths are nearly valid.
-            self.levels = replace(self.levels, path=self.levels.warm)
-        self._world = world
+        others = pose_width(problem.obstacle) - pose_width(solved.obstacle)
+        self._kernel_poses = slice(others, None)
+        cost_term = choose_cost_term(problem, options.objective, options.weight)
+        self.residual_kernels = _residual_kernels(self.spec, kernels, robot, cost_term)
+        self._prepare_check(solved, kernels)
+        self._prepare_levels(solved, levels)
+
+    def _prepare_check(self, solved: Problem, kernels: KernelLibrary) -> None:
+        """Prepare the check on the fine grid, by the kernels of the problem that is solved."""
         self.check = FineCheck(
             solved,
-            world,
+            self._world,
             self.residual_kernels,
             poses=self.kernel_poses,
             penetration=self.penetration if self.measures_hulls else None,
@@ -147,17 +138,24 @@ class Refiner:
         self.accepted_at_ends = cache_last(
             lambda task: self.hulls.accepted_at(task.ends, task.scene.poses[0])
         )
-        every, orders = tuple(vars(self.levels).values()), problem.path_orders
+
+    def _prepare_levels(self, solved: Problem, chosen: GridLevels | None) -> None:
+        """Prepare the grids and the bounds of the chosen or usual levels, for the problem that is solved."""
+        self.levels = chosen or default_grid_levels(self.problem, self.settings)
+        if self.measures_hulls and chosen is None:
+            # Trees avoid the hulls, so that their paths are nearly valid.
+            self.levels = replace(self.levels, path=self.levels.warm)
+        levels: tuple[GridLevel, ...] = tuple(vars(self.levels).values())
         self._grids = {
-            points: make_grid(self.spec, points, orders)
-            for points in {level.points for level in every}
+            points: make_grid(self.spec, points, self.problem.path_orders)
+            for points in {level.points for level in levels}
         }
         self._feedbacks = dict[int, HullFeedback]()
         self._bounds = {
             level: bounds_template(
-                solved, world, self._grids[level.points].s, level.tightening
+                solved, self._world, self._grids[level.points].s, level.tightening
             )
-            for level in every
+            for level in levels
         }
 
     def input_variables(self, task: RefinementTask) -> Array | None:
@@ -170,10 +168,8 @@ class Refiner:
             return None
         if not np.isfinite(task.rate).all() or not np.any(task.rate > 0):
             return None
-        motion, rate = (
-            self.check.transcription(task),
-            np.maximum(task.rate, MIN_RATE_FRACTION * task.rate.max()),
-        )
+        motion = self.check.transcription(task)
+        rate = np.maximum(task.rate, MIN_RATE_FRACTION * task.rate.max())
         return (
             motion.pack(task.path, rate)
             if motion.duration(rate) < MAX_INPUT_DURATION_S
@@ -312,7 +308,8 @@ class Refiner:
         extra: Array | None = None,
     ) -> Result:
         """Run a level again with larger required distances where hulls collide between its grid points."""
-        feedback, motion = self._feedback(level), self.transcription(task, level)
+        feedback = self._feedback(level)
+        motion = self.transcription(task, level)
         accepted = self.accepted_at_ends(task)
         for _ in range(MAX_FEEDBACKS):
             path, _ = motion.unpack(result.x)
@@ -322,10 +319,8 @@ class Refiner:
             if missing is None:
                 break
             extra = missing if extra is None else extra + missing
-            earlier, result = (
-                result.iterations,
-                self.run_level(task, level, result.x, extra=extra),
-            )
+            earlier = result.iterations
+            result = self.run_level(task, level, result.x, extra=extra)
             result = replace(result, iterations=earlier + result.iterations)
         return result
 
@@ -438,10 +433,8 @@ class Refiner:
 
     def other_guesses(self, task: RefinementTask) -> list[Array]:
         """Return the variables of the other initial guesses."""
-        arguments, center = (
-            self._guess_arguments(task),
-            (self.robot.position_lower + self.robot.position_upper) / 2,
-        )
+        arguments = self._guess_arguments(task)
+        center = (self.robot.position_lower + self.robot.position_upper) / 2
         guesses = [
             initial_guesses.straight_line(*arguments),
             initial_guesses.line_through(*arguments, configuration=self.robot.home),
@@ -515,3 +508,28 @@ class Refiner:
         self, task: RefinementTask
     ) -> tuple[Boundary, Array, TrajectorySpec]:
         return task.boundary, self.robot.velocity_limit, self.spec
+
+
+def _residual_kernels(
+    spec: TrajectorySpec,
+    kernels: KernelLibrary,
+    robot: Robot,
+    cost_term: CostTerm | None,
+) -> ResidualKernels:
+    """Load the kernels of the residuals, and of the cost term if there is one."""
+    residual_kernels = ResidualKernels(
+        spec,
+        kernels.load_by_structure(stage_values),
+        kernels.load_by_structure(stage_jacobian),
+        load_step_library(kernels),
+    )
+    if cost_term is None:
+        return residual_kernels
+    return replace(
+        residual_kernels,
+        cost_term=cost_term,
+        cost_residuals=kernels.load_by_structure(
+            cost_term_residuals, terms=cost_term.tables
+        ),
+        cost_counts=residual_counts(robot, cost_term),
+    )

@@ -14,9 +14,8 @@ from dataclasses import dataclass, replace
 from itertools import count, islice, pairwise
 
 import numpy as np
-from numpy.typing import NDArray
 
-from cnpgen.arrays import Array
+from cnpgen.arrays import Array, Mask
 from cnpgen.kernels.collision.tree_search import (
     EqualityKernel,
     TreeSettings,
@@ -72,8 +71,8 @@ class RestSpace:
     robot: Robot
     lower: Array  # bounds of the residuals of a state, shape (m,)
     upper: Array
-    capsules: NDArray[np.bool_]  # mask of the clearances of capsules, shape (m,)
-    equal: NDArray[np.bool_]  # mask of the equalities of positions, shape (m,)
+    capsules: Mask  # mask of the clearances of capsules, shape (m,)
+    equal: Mask  # mask of the equalities of positions, shape (m,)
     kernel_poses: Array  # scene values that the kernels take, shape (width,)
     scene_poses: Array  # poses and sizes of the obstacles of the hulls, shape (width,)
     # Hulls that decide where capsules collide, or without capsules everywhere; None
@@ -102,7 +101,7 @@ class RestSpace:
         )
         return bool(self._met(q)[~self.capsules].all())
 
-    def _met(self, q: Array) -> NDArray[np.bool_]:
+    def _met(self, q: Array) -> Mask:
         """Return a mask of the bounds that the states meet, shape (m, K)."""
         (g,) = self.kernels.values(*self._arguments(q))
         return np.asarray((g >= self.lower[:, None]) & (g <= self.upper[:, None]))
@@ -178,7 +177,7 @@ class RestSpace:
         return w, np.repeat(self.kernel_poses[:, None], count, axis=1)
 
 
-def _first(mask: NDArray[np.bool_]) -> int:
+def _first(mask: Mask) -> int:
     """Return the index of the first true element, or the length if none is true."""
     return int(np.argmax(mask)) if mask.any() else len(mask)
 

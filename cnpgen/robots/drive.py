@@ -6,13 +6,12 @@ sign of the velocity and, at rest, any value of [-1, 1]. 'cnpgen docs drives' ha
 model.
 """
 
-from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
 
-from cnpgen.arrays import Array
+from cnpgen.arrays import Array, NamedErrors
 from cnpgen.errors import counted
 from cnpgen.robots.parameter_ranges import optional_key
 from cnpgen.schema.keys import PerJoint, field
@@ -96,7 +95,7 @@ class DriveSpec:
         form="[[drive.line]] tables",
     )
 
-    def validate(self) -> Iterator[tuple[str, str]]:
+    def validate(self) -> NamedErrors:
         """Yield (key, error) pairs."""
         if (self.rotor_inertia is None) != (self.gear_ratio is None):
             given = "gear_ratio" if self.rotor_inertia is None else "rotor_inertia"

@@ -1,9 +1,10 @@
 """Obstacles of a problem file."""
 
 import math
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
+from cnpgen.arrays import NamedErrors, Vector3
 from cnpgen.robots.parameter_ranges import optional_key
 from cnpgen.robots.shape.hull import MAX_COORDINATE_M, check_solid
 from cnpgen.robots.shape.inline import corners_of, is_inline
@@ -51,19 +52,17 @@ class Obstacle:
     kind: str = optional_key(
         "kind of the obstacle", choices=tuple(_KEYS), default="box"
     )
-    position: tuple[float, float, float] | None = optional_key(
+    position: Vector3 | None = optional_key(
         "position of the centre, for a mesh of the origin of its file: x, y, z",
         unit="m",
     )
-    rotation: tuple[float, float, float] = optional_key(
+    rotation: Vector3 = optional_key(
         "rotation: roll, pitch and yaw about the world's axes, as <origin rpy> of a URDF",
         unit="rad",
         default=_OPTIONAL["rotation"],
         plausible=2 * math.pi,
     )
-    size: tuple[float, float, float] | None = optional_key(
-        "edge lengths of a box", unit="m", low=1e-6
-    )
+    size: Vector3 | None = optional_key("edge lengths of a box", unit="m", low=1e-6)
     radius: float | None = optional_key(
         "radius of a sphere, a cylinder, a capsule", unit="m", low=1e-6
     )
@@ -76,15 +75,15 @@ class Obstacle:
         "mesh file (STL, DAE, OBJ), relative to the problem file; its convex hull is used",
         default="",
     )
-    scale: tuple[float, float, float] = optional_key(
+    scale: Vector3 = optional_key(
         "scale factors of the mesh along x, y and z", default=_OPTIONAL["scale"]
     )
 
-    def validate(self) -> Iterator[tuple[str, str]]:
+    def validate(self) -> NamedErrors:
         """Yield (key, error) pairs."""
         yield from self._mistakes_upright() if self.upright else self._mistakes_posed()
 
-    def value_errors(self) -> Iterator[tuple[str, str]]:
+    def value_errors(self) -> NamedErrors:
         """Yield (key, error) pairs of an obstacle that Python has built: its kind, missing keys, and numbers."""
         if self.kind not in _KEYS:
             yield "kind", f"must be one of {', '.join(_KEYS)}, got {self.kind!r}"
@@ -126,7 +125,7 @@ class Obstacle:
         """Whether its axes differ from the world's axes."""
         return self.rotation != _OPTIONAL["rotation"]
 
-    def _mistakes_upright(self) -> Iterator[tuple[str, str]]:
+    def _mistakes_upright(self) -> NamedErrors:
         if self.top is None and not self.below:
             yield (
                 "top",
@@ -154,7 +153,7 @@ class Obstacle:
                 f"an upright box has {_listed(_UPRIGHT)}: leave this out, or give a box with a pose",
             )
 
-    def _mistakes_posed(self) -> Iterator[tuple[str, str]]:
+    def _mistakes_posed(self) -> NamedErrors:
         known = _KEYS[self.kind]
         needed = [key for key in known if key not in _OPTIONAL]
         instead = (

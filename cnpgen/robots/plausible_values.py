@@ -5,8 +5,8 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from cnpgen.arrays import AnyArray
 from cnpgen.errors import UsageError
 from cnpgen.robots.robot import Robot
 from cnpgen.schema.units import suggested_unit
@@ -40,7 +40,7 @@ class ImplausibleValue:
 
 
 def find_implausible_value(
-    robot: Robot, name: str, values: NDArray[Any], unit: str
+    robot: Robot, name: str, values: AnyArray, unit: str
 ) -> ImplausibleValue | None:
     """Find the first value outside of the plausible range of its quantity; nan and infinite values are ignored.
 
@@ -63,7 +63,7 @@ def find_implausible_value(
 
 def check_plausible(
     robot: Robot,
-    columns: Mapping[str, NDArray[Any]],
+    columns: Mapping[str, AnyArray],
     units: Mapping[str, str],
     *,
     noun: str,

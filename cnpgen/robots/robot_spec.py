@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
+from cnpgen.arrays import NamedErrors, Vector3
 from cnpgen.robots.parameter_ranges import PAYLOAD_CENTRE, optional_key
 from cnpgen.schema.keys import PerJoint, Range, field
 
@@ -27,13 +28,13 @@ class RobotSpec:
     base: tuple[float, ...] = field(
         "base configuration of the planned joints", unit="rad", plausible=100.0
     )
-    tip_offset: tuple[float, float, float] = optional_key(
+    tip_offset: Vector3 = optional_key(
         "offset of the tip in the frame 'tip': x, y, z",
         unit="m",
         default=(0.0, 0.0, 0.0),
         plausible=5.0,
     )
-    tip_rotation: tuple[float, float, float] = optional_key(
+    tip_rotation: Vector3 = optional_key(
         "rotation of the tip in the frame 'tip': roll, pitch and yaw about fixed axes",
         unit="rad",
         default=(0.0, 0.0, 0.0),
@@ -94,7 +95,7 @@ class RobotSpec:
         default=(),
     )
 
-    def validate(self) -> Iterator[tuple[str, str]]:
+    def validate(self) -> NamedErrors:
         """Yield (key, error) pairs."""
         twice = sorted({name for name in self.joints if self.joints.count(name) > 1})
         if twice:
@@ -220,7 +221,7 @@ class Payload:
     """
 
     mass: float = field("mass", unit="kg", low=1e-9)
-    centre: tuple[float, float, float] = field(
+    centre: Vector3 = field(
         "centre of mass in the tip frame",
         unit="m",
         default=(0.0, 0.0, 0.0),
@@ -231,7 +232,7 @@ class Payload:
         unit="kg m^2",
         default=None,
     )
-    size: tuple[float, float, float] | None = field(
+    size: Vector3 | None = field(
         "edge lengths of a box of uniform density, in place of the inertia or, with touch_links, beside it",
         unit="m",
         default=None,
@@ -244,7 +245,7 @@ class Payload:
         default=(),
     )
 
-    def validate(self) -> Iterator[tuple[str, str]]:
+    def validate(self) -> NamedErrors:
         """Yield (key, error) pairs."""
         if self.inertia is not None and self.size is not None and not self.touch_links:
             yield (
@@ -297,7 +298,7 @@ class Payload:
 class HeldObject:
     """Upright cuboid held rigidly with its center at the tip frame."""
 
-    size: tuple[float, float, float] = field(
+    size: Vector3 = field(
         "edge lengths along the tip frame's x, y, z", unit="m", low=1e-6, plausible=10.0
     )
     touch_links: tuple[str, ...] = optional_key(

@@ -10,9 +10,8 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from cnpgen.arrays import Array
+from cnpgen.arrays import AnyArray, Array
 from cnpgen.errors import UsageError, counted
 from cnpgen.robots.obstacle import Obstacle
 from cnpgen.robots.shape.hull import MAX_COORDINATE_M
@@ -67,7 +66,7 @@ class Scene:
     def __len__(self) -> int:
         return len(self.poses)
 
-    def __getitem__(self, index: int | slice | Sequence[int] | NDArray[Any]) -> Scene:
+    def __getitem__(self, index: int | slice | Sequence[int] | AnyArray) -> Scene:
         """Select samples; an integer selects one sample and keeps the first axis."""
         rows: Any = index
         if isinstance(index, int):
@@ -144,10 +143,10 @@ class Scene:
 
     def _check_sample(self, sample: int, argument: str) -> None:
         if not -len(self) <= sample < len(self):
-            text = (
-                f"there is no sample {sample}: {len(self)} samples are numbered from 0"
+            raise SampleIndexError(
+                f"there is no sample {sample}: {counted(len(self), 'sample')}, numbered from 0",
+                concerns=argument,
             )
-            raise SampleIndexError(text, concerns=argument)
 
 
 def sample_obstacles(obstacles: Sequence[Obstacle]) -> dict[str, list[int]]:
@@ -203,7 +202,8 @@ def make_scene_table(
 
 def _quaternions(rotation: Array) -> Array:
     """Return the quaternions (w, x, y, z) of roll, pitch and yaw about fixed axes [rad], shape (M, 3) -> (M, 4)."""
-    (cr, cp, cy), (sr, sp, sy) = np.cos(rotation.T / 2), np.sin(rotation.T / 2)
+    cr, cp, cy = np.cos(rotation.T / 2)
+    sr, sp, sy = np.sin(rotation.T / 2)
     w = cr * cp * cy + sr * sp * sy
     x = sr * cp * cy - cr * sp * sy
     y = cr * sp * cy + sr * cp * sy

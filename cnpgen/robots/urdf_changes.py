@@ -91,7 +91,8 @@ def _fix(joint: Element, position: float, is_stored: bool) -> list[str]:
     """Make a joint fixed at a position; return its errors."""
     import pinocchio as pin
 
-    name, kind = joint.get("name", ""), joint.get("type", "")
+    name = joint.get("name", "")
+    kind = joint.get("type", "")
     if kind == "fixed" and is_stored:
         return []
     if kind not in _TURNING + _SLIDING:
@@ -99,7 +100,8 @@ def _fix(joint: Element, position: float, is_stored: bool) -> list[str]:
             f"joint {name!r} is {kind} and has no position, expected a revolute, continuous or prismatic joint"
         ]
     limit = joint.find("limit")
-    low, high = number_in(limit, "lower", 0.0), number_in(limit, "upper", 0.0)
+    low = number_in(limit, "lower", 0.0)
+    high = number_in(limit, "upper", 0.0)
     if kind != "continuous" and not low - 1e-9 <= position <= high + 1e-9:
         unit = "m" if kind in _SLIDING else "rad"
         return [
@@ -118,14 +120,8 @@ def _fix(joint: Element, position: float, is_stored: bool) -> list[str]:
     for part in [part for part in joint if part.tag in (*_MOTION, "origin")]:
         joint.remove(part)
     joint.set("type", "fixed")
-    joint.insert(
-        0,
-        Element(
-            "origin",
-            xyz=numbers_text(xyz),
-            rpy=numbers_text(pin.rpy.matrixToRpy(rotation)),
-        ),
-    )
+    rpy = numbers_text(pin.rpy.matrixToRpy(rotation))
+    joint.insert(0, Element("origin", xyz=numbers_text(xyz), rpy=rpy))
     return []
 
 
@@ -208,9 +204,15 @@ def _turn(axis: np.ndarray, angle: float) -> np.ndarray:
 
 
 def with_disabled_pairs(
-    urdf: str, srdf: Path, *, allow_unused: Collection[str] = ()
+    urdf: str,
+    srdf: Path,
+    *,
+    planned: Collection[str] = (),
+    allow_unused: Collection[str] = (),
 ) -> str:
     """Return a URDF with the disabled link pairs of an SRDF file, in which some names may be left unused.
+
+    No planned joint may be passive.
 
     URDF parsers ignore unknown elements. Pairs with links that the URDF lacks, such as
     those of another gripper, are left out with a warning that lists the links.
@@ -224,6 +226,10 @@ def with_disabled_pairs(
             [f"{srdf}: is a URDF, expected an SRDF with <{_TAG}> elements"]
         )
     _account_srdf(tree, srdf, allow_unused)
+    passive = {each.get("name", "") for each in tree.iter("passive_joint")}
+    if moved := sorted(passive.intersection(planned)):
+        text = f"<passive_joint> names the planned joint {moved[0]!r}"
+        raise RecipeError([f"{srdf}: {text}: no motor moves it, remove one of both"])
     entries = [dict(entry.attrib) for entry in tree.iter(_TAG)]
     links = {link.get("name", "") for link in urdf_tree(urdf).iter("link")}
     named = {entry[key] for entry in entries for key in _PAIR if key in entry}

@@ -29,7 +29,10 @@ _KNOWN: dict[str, tuple[str, ...]] = {
     "axis": ("xyz",),
     "parent": ("link",),
     "child": ("link",),
-    "limit": ("lower", "upper", "effort", "velocity", "acceleration", "jerk"),
+    "limit": (
+        *("lower", "upper", "effort", "velocity"),
+        *("acceleration", "deceleration", "jerk"),
+    ),
     "dynamics": ("damping", "friction"),
     "mimic": ("joint", "multiplier", "offset"),
     "safety_controller": (
@@ -43,6 +46,7 @@ _KNOWN: dict[str, tuple[str, ...]] = {
     "capsule": ("radius", "length"),
     "mesh": ("filename", "scale"),
 }
+_ANYWHERE = {"name", "type", "version", "group"}  # change nothing elsewhere
 _OPAQUE = {"material", "calibration"}  # colors, and the zero of a sensor
 MAX_LISTED_TAGS = 10
 
@@ -65,16 +69,22 @@ def check_elements(
     *,
     allow_unused: Collection[str] = (),
 ) -> None:
-    """Raise RecipeError for parts of a file whose names are near one that is read, may occur beside them, and does not.
+    """Raise RecipeError for parts of a file that are misspelt or misplaced, or repeat one of which the first alone is read.
 
-    The caller accepts the loss of parts with some names.
+    A misspelt name is near one that is read, may occur beside it, and does not. The
+    caller accepts the loss of misspelt and misplaced parts with some names.
     """
+    if tree.tag != "robot":
+        raise RecipeError([f"{path}: its root is <{tree.tag}>, expected <robot>"])
     hints = {
-        text: nearest(name, names, similarity=MISSPELT)
+        text: nearest(name, names, similarity=MISSPELT) or _other_place(name, known)
         for text, name, names in _unknown(tree, known)
         if name not in allow_unused
     }
-    if parts := [f"{text}{hint}" for text, hint in hints.items() if hint]:
+    parts = [f"{text}{hint}" for text, hint in hints.items() if hint]
+    if "mimic" not in allow_unused:
+        parts += _unknown_leaders(tree)
+    if parts := [*parts, *_repeated(tree, known)]:
         named = listed(parts, MAX_LISTED_TAGS)
         remedy = "rename or remove it, or accept its loss by allow_unused in [robot] (--allow-unused of 'cnpgen init')"
         raise RecipeError([f"{path}: {named} would not be read: {remedy}"])
@@ -84,7 +94,8 @@ def unknown_names(
     tree: Element, known: Mapping[str, tuple[str, ...]] = _KNOWN
 ) -> list[str]:
     """Return the names of the elements and attributes that are not read."""
-    return [name for _, name, _ in _unknown(tree, known)]
+    names = [name for _, name, _ in _unknown(tree, known)]
+    return [*names, *("mimic" for _ in _unknown_leaders(tree))]
 
 
 def _unknown(
@@ -105,3 +116,36 @@ def _unknown(
             yield f"<{child.tag}> in <{element.tag}>", child.tag, missing
         else:
             yield from _unknown(child, table)
+
+
+def _other_place(name: str, table: Mapping[str, tuple[str, ...]]) -> str:
+    """Return the element in which a part is read, for messages, or an empty text."""
+    places = [tag for tag, names in table.items() if name in names]
+    return f" (it belongs in <{places[0]}>)" if places and name not in _ANYWHERE else ""
+
+
+def _unknown_leaders(tree: Element) -> Iterator[str]:
+    """Yield texts of joints that mimic one which the file lacks: parsers drop the <mimic>."""
+    names = [joint.get("name", "") for joint in tree.findall("joint")]
+    for joint in tree.findall("joint"):
+        mimic = joint.find("mimic")
+        if mimic is not None and (leader := mimic.get("joint", "")) not in names:
+            text = f"the <mimic> of {joint.get('name')!r}, which names no joint of the file, {leader!r}"
+            yield f"{text}{nearest(leader, names)},"
+
+
+def _repeated(element: Element, table: Mapping[str, tuple[str, ...]]) -> Iterator[str]:
+    """Yield texts of known elements that occur twice in a link or joint, or of a second shape."""
+    known = table.get(element.tag, ())
+    counts = Counter(
+        "shape" if element.tag == "geometry" else f"<{child.tag}>"
+        for child in element
+        if child.tag in known and child.tag not in {*_REPEATED, *_OPAQUE}
+    )
+    for what, count in counts.items():
+        # A robot has several links, groups and states.
+        if count > 1 and element.tag != "robot":
+            yield f"a second {what} in <{element.tag}>"
+    for child in element:
+        if child.tag in known:
+            yield from _repeated(child, table)

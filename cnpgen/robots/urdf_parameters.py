@@ -199,7 +199,9 @@ def _inertia(link: Element) -> LinkInertia | None:
 
 
 def _joint(element: Element) -> UrdfJoint:
-    limit, kind = element.find("limit"), element.get("type", "")
+    limit = element.find("limit")
+    kind = element.get("type", "")
+    movable = kind in _TURNING_OR_SLIDING
     keys = (
         ("velocity", "effort")
         if kind == "continuous"
@@ -207,9 +209,8 @@ def _joint(element: Element) -> UrdfJoint:
     )
     limits = {} if limit is None else {key: number_in(limit, key, 0.0) for key in keys}
     for key in ("velocity", "effort"):
-        if kind in _TURNING_OR_SLIDING and limits.get(key, 0.0) < 0:
+        if movable and limits.get(key, 0.0) < 0:
             raise ValueError(f"{key}={limits[key]:g} must not be negative")
-    movable = kind in _TURNING_OR_SLIDING
     damping, friction = _dynamics(element)
     ends = {
         tag: found.get("link", "")
@@ -219,9 +220,7 @@ def _joint(element: Element) -> UrdfJoint:
     axis = np.array(numbers_in(element.find("axis"), "xyz", (1.0, 0.0, 0.0)))
     length = float(np.linalg.norm(axis))
     # An axis of length 0, or of an infinite inverse length, cannot be normalized.
-    if kind in _TURNING_OR_SLIDING and not math.isfinite(
-        1 / length if length else math.inf
-    ):
+    if movable and not math.isfinite(1 / length if length else math.inf):
         written = element.find("axis")
         text = None if written is None else written.get("xyz")
         raise ValueError(f"<axis xyz={text!r}> has no direction")

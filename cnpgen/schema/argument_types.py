@@ -72,8 +72,9 @@ def checked_arguments(function: Callable[P, R]) -> Callable[P, R]:
         except CnpgenError:
             raise
         except MemoryError as error:
-            text = f"out of memory in {function.__name__}: {error or 'pass fewer or smaller arrays'}"
-            raise MachineError(text) from error
+            raise MachineError(
+                f"out of memory in {function.__name__}: {error or 'pass fewer or smaller arrays'}"
+            ) from error
         # An exception of Python may come from a wrong type: then the argument is named,
         # otherwise it is raised again.
         except Exception:

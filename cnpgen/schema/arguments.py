@@ -87,6 +87,24 @@ def number(name: str, value: Any) -> float:
     return found
 
 
+def positive(name: str, value: Any, unit: str = "") -> float:
+    """Return an argument [unit] as a float; raise UsageError if it is not finite and above 0."""
+    found = number(name, value)
+    if found <= 0:
+        raise UsageError(
+            f"must be above 0{unit and ' '}{unit}, got {value}", argument=name
+        )
+    return found
+
+
+def not_negative(name: str, value: Any) -> float:
+    """Return an argument as a float; raise UsageError if it is not finite, or negative."""
+    found = number(name, value)
+    if found < 0:
+        raise UsageError(f"must not be negative, got {value}", argument=name)
+    return found
+
+
 def numbers(
     name: str,
     values: ArrayLike,

@@ -9,6 +9,7 @@ from functools import cache
 from types import UnionType
 from typing import Any, Union, get_args, get_origin, get_type_hints
 
+from cnpgen.arrays import JsonObject
 from cnpgen.schema.units import dimension, show
 
 
@@ -168,7 +169,7 @@ class RecipeLocation:
 
 def to_dict(
     obj: Any, *, label: Callable[[Any], Mapping[str, Any]] = lambda _: {}
-) -> dict[str, Any]:
+) -> JsonObject:
     """Turn an object declared with ``field`` into plain dicts, lists, numbers and strings, all in SI.
 
     Fields that are not keys are omitted; ``label`` returns further entries of an

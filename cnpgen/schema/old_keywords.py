@@ -2,8 +2,10 @@
 
 import dataclasses
 import warnings
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from typing import Any, TypeVar
+
+from cnpgen.arrays import NamedErrors
 
 Options = TypeVar("Options")
 
@@ -64,7 +66,7 @@ def old_attribute(old: str, new: str) -> Any:
     return property(read, doc=f"The former name of ``{new}``.")
 
 
-def errors_of(made: Any) -> Iterator[tuple[str, str]]:
+def errors_of(made: Any) -> NamedErrors:
     """Yield the (key, error) pairs of a table's own check, also of a plug-in with the former name of the method.
 
     The pairs come one by one: a check that fails at a value of a wrong type has reported the errors before it.

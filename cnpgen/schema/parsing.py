@@ -9,6 +9,7 @@ from contextvars import ContextVar
 from dataclasses import MISSING, dataclass
 from typing import Any, NoReturn, TypeVar, get_args, get_origin
 
+from cnpgen.arrays import JsonObject
 from cnpgen.errors import nearest
 from cnpgen.schema.keys import Key, PerJoint, Range, RecipeLocation, keys
 from cnpgen.schema.old_keywords import errors_of
@@ -169,7 +170,7 @@ class _Parser:
 
     def entries(
         self, hint: Any, values: Any, key: Key, where: RecipeLocation
-    ) -> dict[str, Any]:
+    ) -> JsonObject:
         _check_filled(dict, values, key)
         for name in values:
             if key.pattern and not re.fullmatch(key.pattern, name):

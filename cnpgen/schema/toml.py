@@ -3,8 +3,9 @@
 import re
 import tomllib
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
+from cnpgen.arrays import JsonObject
 from cnpgen.schema.texts import read_at_most, utf8_text
 
 Kind = Literal["problem", "pipeline", "dataset", "suite"]
@@ -45,7 +46,7 @@ def kind_of_file(path: Path) -> Kind:
 
 def read_table(
     path: Path, kinds: tuple[Kind, ...], errors: list[str]
-) -> dict[str, Any] | None:
+) -> JsonObject | None:
     """Return the top-level table of a recipe file, or None after an error, such as a recipe of another kind."""
     try:
         table = _read(path)
@@ -71,7 +72,7 @@ def read_table(
     return None
 
 
-def _read(path: Path) -> dict[str, Any]:
+def _read(path: Path) -> JsonObject:
     """Read a file and parse it as TOML; raise ValueError with the line of an error."""
     data = read_at_most(path, MAX_RECIPE_BYTES, "a recipe")
     content = utf8_text(data)
@@ -91,6 +92,6 @@ def _read(path: Path) -> dict[str, Any]:
         raise ValueError(f"line {line}: not valid TOML: {text}") from error
 
 
-def is_kind(kind: Kind, table: dict[str, Any]) -> bool:
+def is_kind(kind: Kind, table: JsonObject) -> bool:
     """Return whether a top-level table has a key that is specific to a kind."""
     return not MARKS[kind].isdisjoint(table)

@@ -4,10 +4,10 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
+from cnpgen.arrays import JsonObject
 from cnpgen.errors import DatasetError
 from cnpgen.store.checked_shard import Shard, read_rows
 from cnpgen.store.dataset_spec import (
@@ -122,7 +122,7 @@ def _reason(error: DatasetError, path: Path) -> str:
 
 def _check_manifest(
     folder: Path, spec: DatasetSpec
-) -> tuple[list[Finding], dict[str, Any]]:
+) -> tuple[list[Finding], JsonObject]:
     """Check the manifest and the files it lists.
 
     Return also the manifest, empty if it is not valid.
@@ -150,8 +150,14 @@ def _check_manifest(
     for name in (name for name in LISTED if name in manifest["files"]):
         entry = manifest["files"][name]
         if name == CROISSANT and not (folder / name).exists():
-            text = "is missing, as in published datasets"
-            findings.append(Finding(name, text, note=True, hint=REMAKE_HINT))
+            findings.append(
+                Finding(
+                    name,
+                    "is missing, as in published datasets",
+                    note=True,
+                    hint=REMAKE_HINT,
+                )
+            )
         else:
             findings += _check_file(folder, name, entry["sha256"], entry["bytes"])
     return findings, manifest
@@ -184,7 +190,7 @@ def check_shard(
     folder: Path,
     spec: DatasetSpec,
     task: ShardTask,
-    entry: dict[str, Any] | None = None,
+    entry: JsonObject | None = None,
 ) -> list[Finding]:
     """Check one shard and its sidecar.
 
@@ -227,7 +233,7 @@ def _is_of_another_spec(path: Path, spec: DatasetSpec) -> bool:
 
 
 def _check_sidecar(
-    folder: Path, spec: DatasetSpec, task: ShardTask, entry: dict[str, Any] | None
+    folder: Path, spec: DatasetSpec, task: ShardTask, entry: JsonObject | None
 ) -> tuple[list[Finding], tuple[str, int] | None]:
     """Check a sidecar; return also the recorded sha256 and size of the shard, or None if neither record is valid."""
     expected = None if entry is None else (entry["sha256"], entry["bytes"])
@@ -245,8 +251,13 @@ def _check_sidecar(
         else _check_file(folder, task.sidecar, entry["sidecar"]["sha256"])
     )
     if record.specification_fingerprint != spec.version_with(task).fingerprint:
-        text = f"belongs to another specification ({record.specification_fingerprint[:12]}...)"
-        findings.append(Finding(task.sidecar, text, hint=REMAKE_HINT))
+        findings.append(
+            Finding(
+                task.sidecar,
+                f"belongs to another specification ({record.specification_fingerprint[:12]}...)",
+                hint=REMAKE_HINT,
+            )
+        )
     return findings, expected or (record.sha256, record.bytes)
 
 

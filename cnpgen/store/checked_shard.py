@@ -4,11 +4,10 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from cnpgen.arrays import AnyArray, Columns
 from cnpgen.errors import DatasetError
 from cnpgen.store.dataset_spec import DatasetSpec, ShardTask
 from cnpgen.store.field import Field
@@ -63,15 +62,13 @@ class Shard:
         return size_problem(self.path, self.size)
 
 
-def read_checked(shard: Shard) -> dict[str, NDArray[Any]]:
+def read_checked(shard: Shard) -> Columns:
     """Verify a shard and read its fields; see ``read_rows``."""
     require_intact(shard.path, size=shard.size, sha256=shard.sha256)
     return read_rows(shard)
 
 
-def read_rows(
-    shard: Shard, names: Iterable[str] | None = None
-) -> dict[str, NDArray[Any]]:
+def read_rows(shard: Shard, names: Iterable[str] | None = None) -> Columns:
     """Read and check fields of a shard, by default all, after its sha256 was compared.
 
     The result is field name -> values as stored, shape (rows, width) or (rows,). A
@@ -162,7 +159,7 @@ def check_field(shard: Shard, item: Field, placement: StoredField | None) -> Non
 
 def read_columns(
     shard: Shard, placements: Mapping[str, StoredField], names: Iterable[str]
-) -> dict[str, NDArray[Any]]:
+) -> Columns:
     """Read fields of a shard after ``check_header``; values that are contiguous in the file are read directly.
 
     Reading a file that is truncated meanwhile raises DatasetError; reading its memory
@@ -172,7 +169,7 @@ def read_columns(
     # Chunked and packed datasets have no single position; HDF5 reads them.
     if any(place.offset is None for place in selected.values()):
         return read_shard(shard.path, list(selected))
-    columns: dict[str, NDArray[Any]] = {}
+    columns: Columns = {}
     with machine_errors("read", shard.path), shard.path.open("rb", buffering=0) as file:
         for name, place in selected.items():
             columns[name] = np.empty(place.shape, place.dtype)
@@ -188,7 +185,7 @@ def read_columns(
     return columns
 
 
-def check_values(shard: Shard, columns: Mapping[str, NDArray[Any]]) -> None:
+def check_values(shard: Shard, columns: Mapping[str, AnyArray]) -> None:
     """Raise DatasetError for values that are not finite, parameters out of range, and wrong sample IDs."""
     problem = finite_problem(columns) or _range_problem(shard.spec, columns)
     if problem:
@@ -202,7 +199,7 @@ def check_values(shard: Shard, columns: Mapping[str, NDArray[Any]]) -> None:
         )
 
 
-def _range_problem(spec: DatasetSpec, columns: Mapping[str, NDArray[Any]]) -> str:
+def _range_problem(spec: DatasetSpec, columns: Mapping[str, AnyArray]) -> str:
     """Describe the first parameter of the problem with a value outside of its range; empty if there is none."""
     fields = {field.name: field for field in spec.fields if field.valid_max}
     if PARAMETERS not in columns.keys() & fields.keys():

@@ -5,8 +5,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from cnpgen.arrays import Columns, Integers
 from cnpgen.errors import DatasetError, counted
 from cnpgen.store.field import Field
 from cnpgen.store.files.figure_file import new_figure, save_figure
@@ -118,7 +118,7 @@ def _draw_task_space(figure: "SubFigure", inspection: Inspection) -> None:
         axis.tick_params(labelsize=7)
 
 
-def _some_rows(inspection: Inspection) -> dict[str, NDArray[Any]]:
+def _some_rows(inspection: Inspection) -> Columns:
     """Read the first rows of the first split that has rows."""
     dataset = open_dataset(inspection.folder, allow_incomplete=True)
     names = ("start_xyz", "goal_xyz", "hit_angle", "hit_speed")
@@ -129,16 +129,14 @@ def _some_rows(inspection: Inspection) -> dict[str, NDArray[Any]]:
     return dataset.read(split, fields=fields, start=first.first_row, stop=end)
 
 
-def _draw_motions(axis: "Axes", rows: dict[str, NDArray[Any]]) -> None:
+def _draw_motions(axis: "Axes", rows: Columns) -> None:
     for end, color in _COLORS.items():
         x, y = rows[f"{end}_xyz"][:, :2].T
         axis.plot(x, y, ".", color=color, markersize=2, label=end)
     if "hit_angle" in rows and "hit_speed" in rows:
-        (x, y), angle, length = (
-            rows["goal_xyz"][:, :2].T,
-            rows["hit_angle"],
-            ARROW_DURATION_S * rows["hit_speed"],
-        )
+        x, y = rows["goal_xyz"][:, :2].T
+        angle = rows["hit_angle"]
+        length = ARROW_DURATION_S * rows["hit_speed"]
         arrows: dict[str, Any] = {
             "angles": "xy",
             "scale_units": "xy",
@@ -186,7 +184,7 @@ def _draw_acceptance(
     figure.colorbar(image, ax=axis, shrink=0.8).ax.tick_params(labelsize=7)
 
 
-def _coarsened(density: DensityMap) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+def _coarsened(density: DensityMap) -> tuple[Integers, Integers]:
     """Return candidates and accepted candidates per cell of the finest grid with enough candidates per cell."""
     cells = min(density.candidates.shape)
     # Cells are merged k by k for the divisors k of the grid, the finest grid first.
@@ -200,7 +198,7 @@ def _coarsened(density: DensityMap) -> tuple[NDArray[np.int64], NDArray[np.int64
     return _summed(density.candidates, factor), _summed(density.accepted, factor)
 
 
-def _summed(counts: NDArray[np.int64], k: int) -> NDArray[np.int64]:
+def _summed(counts: Integers, k: int) -> Integers:
     """Return the sums over k by k cells."""
     nx, ny = counts.shape
     # Axes 1 and 3 run over the k by k cells that are merged.

@@ -12,10 +12,10 @@ from dataclasses import asdict, dataclass, field, replace
 from functools import cached_property
 from itertools import pairwise
 from pathlib import Path
-from typing import Any
 
+from cnpgen.arrays import JsonMapping, JsonObject
 from cnpgen.errors import DatasetError, UsageError, nearest
-from cnpgen.store.field import Field
+from cnpgen.store.field import Field, Fields
 from cnpgen.store.files.atomic import read_file
 from cnpgen.store.files.document_structure import (
     ANY_KEY,
@@ -169,7 +169,7 @@ class DatasetSpec:
     title: str = ""
     license: str = ""
     recipe_sha256: str
-    recipe: Mapping[str, Any]
+    recipe: JsonMapping
     seed: int
     splits: Mapping[str, int]
     shard_size: int
@@ -178,8 +178,8 @@ class DatasetSpec:
     backend: str
     generator: str = "numpy SFC64 seeded by SeedSequence"
     revision: int = GENERATOR_REVISION
-    fields: tuple[Field, ...]
-    robot: Mapping[str, Any] = field(default_factory=dict)
+    fields: Fields
+    robot: JsonMapping = field(default_factory=dict)
     versions: Mapping[str, str] = field(default_factory=dict)
     previous_splits: tuple[Mapping[str, int], ...] = ()
     scene_obstacles: int = 0
@@ -262,14 +262,14 @@ class DatasetSpec:
         )
 
     @property
-    def stages(self) -> list[dict[str, Any]]:
+    def stages(self) -> list[JsonObject]:
         """The resolved stages that draw the samples.
 
         Raises:
             DatasetError: The specification does not contain its stages.
         """
         self._require({"pipeline": {"stage": [{"use": TEXT}]}}, "the stages")
-        stages: list[dict[str, Any]] = self.recipe["pipeline"]["stage"]
+        stages: list[JsonObject] = self.recipe["pipeline"]["stage"]
         return stages
 
     def _require(self, structure: Structure, content: str) -> None:
@@ -285,7 +285,7 @@ class DatasetSpec:
             ) from error
 
     @cached_property
-    def scene_fields(self) -> tuple[Field, ...]:
+    def scene_fields(self) -> Fields:
         """The fields of the scene of each sample, flattened.
 
         They are stored once for each scene.
@@ -353,8 +353,10 @@ def _check_sizes(spec: DatasetSpec) -> None:
 def _check_names(spec: DatasetSpec) -> None:
     for split in spec.splits:
         if not SPLIT_NAME.fullmatch(split):
-            text = f"the name of a split must have letters, digits and '_' and start with a letter, got {split!r}"
-            raise UsageError(text)
+            raise UsageError(
+                "the name of a split must have letters, digits and '_' and start with a letter, got "
+                f"{split!r}"
+            )
     names = [item.name for item in spec.fields]
     if not names or len(set(names)) != len(names) or len(names) > MAX_FIELDS:
         raise UsageError(
@@ -427,7 +429,7 @@ def shard_attributes(spec: DatasetSpec, task: ShardTask) -> dict[str, str | int]
     }
 
 
-def to_json(spec: DatasetSpec) -> dict[str, Any]:
+def to_json(spec: DatasetSpec) -> JsonObject:
     """Return a specification as a JSON-able dict."""
     converted = {
         # JSON numbers of other readers have 53 bits
@@ -446,7 +448,7 @@ def to_json(spec: DatasetSpec) -> dict[str, Any]:
     return {name: getattr(spec, name) for name in names} | converted
 
 
-def from_json(content: Mapping[str, Any]) -> DatasetSpec:
+def from_json(content: JsonMapping) -> DatasetSpec:
     """Rebuild a specification from the result of ``to_json``.
 
     A missing key or a wrong type raises DatasetError.

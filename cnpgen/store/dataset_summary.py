@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any
 
+from cnpgen.arrays import JsonObject
 from cnpgen.errors import DatasetError
 from cnpgen.store.dataset_spec import DatasetSpec, ShardTask, shards
 from cnpgen.store.files.document_structure import ANY_KEY, TEXT
@@ -146,7 +146,7 @@ def unfinished(summary: DatasetSummary) -> str:
     return f"unfinished: {progress}; {RERUN_HINT}"
 
 
-def stats_document(summary: DatasetSummary) -> dict[str, Any]:
+def stats_document(summary: DatasetSummary) -> JsonObject:
     """Return the content of ``stats.json``: statistics of every field and density maps, split by split."""
     return {
         "format": STATS_FORMAT,
@@ -163,7 +163,7 @@ def stats_document(summary: DatasetSummary) -> dict[str, Any]:
     }
 
 
-def load_stats_document(folder: Path) -> dict[str, Any]:
+def load_stats_document(folder: Path) -> JsonObject:
     """Read ``stats.json``; raise DatasetError if it is missing, damaged or of another format version."""
     return load_document(
         folder / STATS, STATS_FORMAT, version=STATS_VERSION, structure=STATS_STRUCTURE

@@ -37,10 +37,7 @@ class Field:
 
     def __post_init__(self) -> None:
         # Floats, as read from JSON, because they are part of the fingerprint.
-        for name in (
-            "valid_min",
-            "valid_max",
-        ):
+        for name in ("valid_min", "valid_max"):
             limits = getattr(self, name)
             if limits is not None:
                 object.__setattr__(self, name, tuple(map(float, limits)))
@@ -64,3 +61,7 @@ class Field:
             if self.width
             else (self.name,)
         )
+
+
+Fields = tuple[Field, ...]
+"""The fields of a dataset, or those that a stage fills, in their order."""

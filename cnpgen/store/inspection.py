@@ -7,8 +7,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any
 
+from cnpgen.arrays import JsonObject
 from cnpgen.errors import DatasetError
 from cnpgen.store.check import check_documents
 from cnpgen.store.dataset_spec import DatasetSpec, load_dataset_spec, shards
@@ -97,7 +97,7 @@ class Inspection:
         """Different combinations of versions of cnpgen, Python and libraries that made the shards."""
         return self.summary.environments
 
-    def to_dict(self) -> dict[str, Any]:
+    def to_dict(self) -> JsonObject:
         """Return everything for JSON."""
         spec = self.spec
         content = {
@@ -130,10 +130,10 @@ class Inspection:
             "versions": spec.versions,
             "environments": self.environments,
         }
-        result: dict[str, Any] = plain(content)
+        result: JsonObject = plain(content)
         return result
 
-    def _field(self, field: Field) -> dict[str, Any]:
+    def _field(self, field: Field) -> JsonObject:
         names = (
             "name",
             "unit",
@@ -158,11 +158,11 @@ class Inspection:
         }
 
 
-def _attributes(item: object, *names: str) -> dict[str, Any]:
+def _attributes(item: object, *names: str) -> JsonObject:
     return {name: getattr(item, name) for name in names}
 
 
-def _yield(sampling: SamplingStatistics) -> dict[str, Any]:
+def _yield(sampling: SamplingStatistics) -> JsonObject:
     """Return the numbers of candidates and, in pipeline order, of rejections with the fractions that remain."""
     tried = max(sampling.tried, 1)
     left = sampling.tried

@@ -10,8 +10,9 @@ from collections.abc import Iterable
 from contextlib import suppress
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any, cast
+from typing import cast
 
+from cnpgen.arrays import JsonObject
 from cnpgen.errors import DatasetError, UsageError
 from cnpgen.store.dataset_document import DatasetDocument
 from cnpgen.store.dataset_spec import DatasetSpec, shards
@@ -51,7 +52,7 @@ def finalize(
     *,
     notes: str = "",
     documents: Iterable[DatasetDocument] = (),
-) -> dict[str, Any]:
+) -> JsonObject:
     """Summarize the shards of a dataset: write statistics, descriptions and, last, the manifest.
 
     The same shards give the same files, so several processes may do it at the same
@@ -76,7 +77,7 @@ def finalize(
     # Other files in it are kept.
     with suppress(OSError):
         (folder / WORK).rmdir()
-    return cast(dict[str, Any], plain(manifest))
+    return cast(JsonObject, plain(manifest))
 
 
 def _name(folder: Path) -> str:
@@ -87,7 +88,7 @@ def _name(folder: Path) -> str:
     return os.fsencode(folder.resolve().name).decode(errors="replace")
 
 
-def load_manifest(folder: Path) -> dict[str, Any]:
+def load_manifest(folder: Path) -> JsonObject:
     """Read ``manifest.json``.
 
     Raise DatasetError if it is missing, damaged or of another format version.
@@ -108,7 +109,7 @@ def load_manifest(folder: Path) -> dict[str, Any]:
     return manifest
 
 
-def shard_entries(manifest: dict[str, Any]) -> dict[str, dict[str, Any]]:
+def shard_entries(manifest: JsonObject) -> dict[str, JsonObject]:
     """Return the entries of the shards of all splits, by file."""
     return {
         entry["file"]: entry
@@ -117,7 +118,7 @@ def shard_entries(manifest: dict[str, Any]) -> dict[str, dict[str, Any]]:
     }
 
 
-def lists_shards_of(manifest: dict[str, Any], spec: DatasetSpec) -> bool:
+def lists_shards_of(manifest: JsonObject, spec: DatasetSpec) -> bool:
     """Return whether a manifest lists exactly the shards of a specification, in order.
 
     Only these file names are opened: no path in a manifest can lead outside the folder
@@ -174,11 +175,13 @@ def _created(summary: DatasetSummary) -> str:
         instant = datetime.fromtimestamp(int(last), UTC) if fixed is None else fixed
         return instant.strftime("%Y-%m-%dT%H:%M:%SZ")
     except (ValueError, OverflowError, OSError) as error:
-        text = f"the creation time of the dataset is unknown: the record of a shard has no valid start time ({error})"
-        raise DatasetError(text) from error
+        raise DatasetError(
+            "the creation time of the dataset is unknown: the record of a shard has no valid start "
+            f"time ({error})"
+        ) from error
 
 
-def _manifest(folder: Path, summary: DatasetSummary, *, created: str) -> dict[str, Any]:
+def _manifest(folder: Path, summary: DatasetSummary, *, created: str) -> JsonObject:
     """Build the manifest; the files that it lists must exist."""
     spec = summary.spec
     return {
@@ -218,7 +221,7 @@ def data_fingerprint(files: Iterable[tuple[str, str]]) -> str:
     return hashlib.sha256(lines.encode()).hexdigest()
 
 
-def _origin(summary: DatasetSummary) -> dict[str, Any]:
+def _origin(summary: DatasetSummary) -> JsonObject:
     """Describe the origin of the samples.
 
     "environments" are all combinations of versions that made shards.
@@ -241,7 +244,7 @@ def _origin(summary: DatasetSummary) -> dict[str, Any]:
     }
 
 
-def _feature(field: Field, spec: DatasetSpec) -> dict[str, Any]:
+def _feature(field: Field, spec: DatasetSpec) -> JsonObject:
     """Describe a field with the keys of LeRobot's ``info.json``, and its unit, which LeRobot does not have."""
     return {
         "dtype": spec.dtype if field.dtype == "float" else field.dtype,
@@ -255,7 +258,7 @@ def _feature(field: Field, spec: DatasetSpec) -> dict[str, Any]:
     }
 
 
-def _split(folder: Path, summary: DatasetSummary, split: str) -> dict[str, Any]:
+def _split(folder: Path, summary: DatasetSummary, split: str) -> JsonObject:
     """List the shards of a split."""
     entries = [
         {

@@ -4,11 +4,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from cnpgen.arrays import AnyArray, Columns, JsonObject
 from cnpgen.errors import DatasetError, lacks
 from cnpgen.store.checked_shard import Shard, read_rows, read_scenes
 from cnpgen.store.dataset_spec import DatasetSpec, ShardTask, load_dataset_spec, shards
@@ -31,7 +30,7 @@ class StoredDataset:
 
     folder: Path
     spec: DatasetSpec
-    manifest: dict[str, Any] | None
+    manifest: JsonObject | None
 
     def tasks(self, split: str) -> list[ShardTask]:
         """List the existing shards of a split, in order.
@@ -58,7 +57,7 @@ class StoredDataset:
         fields: Sequence[str] | None = None,
         start: int = 0,
         stop: int | None = None,
-    ) -> dict[str, NDArray[Any]]:
+    ) -> Columns:
         """Read rows ``start`` to ``stop`` of a split; of an unfinished dataset, only the existing ones of them.
 
         By default, all fields are read, in the order of the specification, and all
@@ -75,7 +74,7 @@ class StoredDataset:
                 f"split {split!r} has rows 0 to {rows}, got {start} to {stop}"
             )
         # An empty first part gives shape and type to a selection without rows.
-        parts: dict[str, list[NDArray[Any]]] = {
+        parts: dict[str, list[AnyArray]] = {
             name: [self._no_rows(name)] for name in names
         }
         for task in tasks:
@@ -123,7 +122,7 @@ class StoredDataset:
         return shard
 
     @cached_property
-    def _entries(self) -> dict[str, dict[str, Any]]:
+    def _entries(self) -> dict[str, JsonObject]:
         """Shard -> its entry in the manifest; empty without a manifest."""
         return shard_entries(self.manifest or {})
 
@@ -134,7 +133,7 @@ class StoredDataset:
             else [f.name for f in self.spec.fields]
         )
 
-    def _no_rows(self, name: str) -> NDArray[Any]:
+    def _no_rows(self, name: str) -> AnyArray:
         field = self.spec.field_named(name)
         return np.empty(field.shape(0), storage_dtype(field, self.spec.dtype))
 

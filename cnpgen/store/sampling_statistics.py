@@ -6,11 +6,10 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import reduce
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from cnpgen.arrays import Integers, JsonMapping, JsonObject
 from cnpgen.errors import DatasetError
 from cnpgen.store.files.document_structure import ANY_KEY, NUMBER, TEXT, WHOLE
 from cnpgen.store.files.documents import plain
@@ -29,8 +28,8 @@ class DensityMap:
 
     x: tuple[float, float]
     y: tuple[float, float]
-    candidates: NDArray[np.int64]
-    accepted: NDArray[np.int64]
+    candidates: Integers
+    accepted: Integers
 
     def merge(self, other: DensityMap) -> DensityMap:
         """Add the counts of two maps of the same grid.
@@ -108,7 +107,7 @@ class SamplingStatistics:
             verification=worst,
         )
 
-    def yield_json(self) -> dict[str, Any]:
+    def yield_json(self) -> JsonObject:
         """Return tried, accepted and rejections as a JSON-able dict."""
         return {
             "tried": self.tried,
@@ -116,7 +115,7 @@ class SamplingStatistics:
             "rejections": dict(self.rejections),
         }
 
-    def to_json(self) -> dict[str, Any]:
+    def to_json(self) -> JsonObject:
         """Return everything as a JSON-able dict."""
         return {
             **self.yield_json(),
@@ -142,7 +141,7 @@ def _merged_order(first: Sequence[str], second: Sequence[str]) -> list[str]:
     return merged
 
 
-def densities_to_json(densities: Mapping[str, DensityMap]) -> dict[str, Any]:
+def densities_to_json(densities: Mapping[str, DensityMap]) -> JsonObject:
     """Return density maps as a JSON-able dict."""
     return {name: plain(vars(item)) for name, item in densities.items()}
 
@@ -165,7 +164,7 @@ SAMPLING_STRUCTURE = {
 }
 
 
-def _density(content: Mapping[str, Any]) -> DensityMap:
+def _density(content: JsonMapping) -> DensityMap:
     (x_low, x_high), (y_low, y_high) = content["x"], content["y"]
     candidates, accepted = (
         np.array(content[key], np.int64) for key in ("candidates", "accepted")
@@ -183,7 +182,7 @@ def _density(content: Mapping[str, Any]) -> DensityMap:
     )
 
 
-def sampling_from_json(content: Mapping[str, Any]) -> SamplingStatistics:
+def sampling_from_json(content: JsonMapping) -> SamplingStatistics:
     """Rebuild sampling statistics from a dict with the structure ``SAMPLING_STRUCTURE``."""
     return SamplingStatistics(
         **{

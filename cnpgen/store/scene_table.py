@@ -10,11 +10,10 @@ from __future__ import annotations
 import json
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from cnpgen.arrays import AnyArray, Indices, Integers, JsonObject
 from cnpgen.errors import DatasetError
 from cnpgen.store.field import Field
 
@@ -117,26 +116,26 @@ class SceneTable:
         obstacle_quaternion: Quaternions (w, x, y, z) of length 1, shape (S, O, 4).
     """
 
-    scene_ids: NDArray[np.int64]
-    scene_family: NDArray[np.int64]
-    obstacle_count: NDArray[np.int64]
-    obstacle_kind: NDArray[np.int64]
-    obstacle_size: NDArray[Any]
-    obstacle_position: NDArray[Any]
-    obstacle_quaternion: NDArray[Any]
+    scene_ids: Integers
+    scene_family: Integers
+    obstacle_count: Integers
+    obstacle_kind: Integers
+    obstacle_size: AnyArray
+    obstacle_position: AnyArray
+    obstacle_quaternion: AnyArray
 
     def __len__(self) -> int:
         return len(self.scene_ids)
 
-    def __getitem__(self, scenes: NDArray[Any] | slice) -> SceneTable:
+    def __getitem__(self, scenes: AnyArray | slice) -> SceneTable:
         """Select scenes by indices, a mask or a slice."""
         return SceneTable(**{name: values[scenes] for name, values in self.arrays()})
 
-    def arrays(self) -> Iterator[tuple[str, NDArray[Any]]]:
+    def arrays(self) -> Iterator[tuple[str, AnyArray]]:
         """Yield names and arrays, in stored order."""
         return ((item.name, getattr(self, item.name)) for item in fields(self))
 
-    def rows_of(self, scene_id: NDArray[np.int64]) -> NDArray[np.intp]:
+    def rows_of(self, scene_id: Integers) -> Indices:
         """Return the index of the scene of each of N samples, shape (N,).
 
         An unknown scene ID raises DatasetError.
@@ -182,7 +181,7 @@ def distinct_scenes(tables: Sequence[SceneTable]) -> SceneTable:
     return table[np.unique(table.scene_ids, return_index=True)[1]]
 
 
-def scene_attributes(families: Sequence[str]) -> dict[str, dict[str, Any]]:
+def scene_attributes(families: Sequence[str]) -> dict[str, JsonObject]:
     """Return the HDF5 attributes of the arrays for families in the order of their indices."""
     return {
         item.name: {
@@ -198,7 +197,7 @@ def scene_attributes(families: Sequence[str]) -> dict[str, dict[str, Any]]:
 
 
 def check_scenes(
-    table: SceneTable, obstacles: int, scene_id: NDArray[np.int64], families: int
+    table: SceneTable, obstacles: int, scene_id: Integers, families: int
 ) -> None:
     """Check the scenes of a shard with a capacity of obstacles and a number of families; raise DatasetError.
 

@@ -12,8 +12,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from cnpgen.arrays import AnyArray, Columns, JsonObject
 from cnpgen.errors import DatasetError, nearest
 from cnpgen.store.field import Field
 from cnpgen.store.files.atomic import committing
@@ -35,9 +35,9 @@ def storage_dtype(field: Field, dtype: str) -> np.dtype[Any]:
     return np.dtype(_STORAGE[name])
 
 
-def field_attributes(field: Field) -> dict[str, Any]:
+def field_attributes(field: Field) -> JsonObject:
     """Return the HDF5 attributes of a field; arrays have shape (max(width, 1),)."""
-    attributes: dict[str, Any] = {
+    attributes: JsonObject = {
         "units": field.unit,
         "long_name": field.long_name,
         "names": json.dumps(list(field.names)),
@@ -54,7 +54,7 @@ def field_attributes(field: Field) -> dict[str, Any]:
 
 def write_shard(
     path: Path,
-    columns: Mapping[str, NDArray[Any]],
+    columns: Mapping[str, AnyArray],
     fields: Sequence[Field],
     attributes: Mapping[str, str | int],
     *,
@@ -97,7 +97,7 @@ def write_shard(
 
 
 def _check_columns(
-    columns: Mapping[str, NDArray[Any]], fields: Sequence[Field], rows: int, dtype: str
+    columns: Mapping[str, AnyArray], fields: Sequence[Field], rows: int, dtype: str
 ) -> None:
     """Raise an error if the columns do not fit the fields."""
     names = {field.name for field in fields}
@@ -120,7 +120,7 @@ def _check_columns(
         raise DatasetError(problem)
 
 
-def finite_problem(columns: Mapping[str, NDArray[Any]]) -> str:
+def finite_problem(columns: Mapping[str, AnyArray]) -> str:
     """Describe the first column with a value that is not finite.
 
     Empty if there is none.
@@ -132,7 +132,7 @@ def finite_problem(columns: Mapping[str, NDArray[Any]]) -> str:
     return ""
 
 
-def _is_finite(values: NDArray[Any]) -> bool:
+def _is_finite(values: AnyArray) -> bool:
     """Return whether all values are finite.
 
     Their sum, which needs no memory, is infinite only by overflow.
@@ -144,7 +144,7 @@ def _is_finite(values: NDArray[Any]) -> bool:
 
 
 def _encode(
-    parts: Sequence[tuple[str, NDArray[Any], dict[str, Any]]],
+    parts: Sequence[tuple[str, AnyArray, JsonObject]],
     attributes: Mapping[str, str | int],
 ) -> memoryview:
     """Build the file in memory: a full disk then causes a plain system error, and no partial file."""
@@ -163,9 +163,7 @@ def _encode(
     return buffer.getbuffer()
 
 
-def read_shard(
-    path: Path, fields: Sequence[str] | None = None
-) -> dict[str, NDArray[Any]]:
+def read_shard(path: Path, fields: Sequence[str] | None = None) -> Columns:
     """Read whole fields of a shard, by default all: field name -> values, shape (rows, width) or (rows,).
 
     A damaged file and an unknown field raise DatasetError.
@@ -208,7 +206,7 @@ class StoredField:
     shape: tuple[int, ...]
     dtype: np.dtype[Any]
     offset: int | None
-    attributes: dict[str, Any]
+    attributes: JsonObject
 
 
 def read_schema(path: Path) -> dict[str, StoredField]:

@@ -3,10 +3,8 @@
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields
 from pathlib import Path
-from typing import Any
 
-from numpy.typing import NDArray
-
+from cnpgen.arrays import AnyArray, JsonMapping, JsonObject
 from cnpgen.errors import CnpgenError, DatasetError
 from cnpgen.store.dataset_spec import DatasetSpec, ShardTask, shard_attributes, shards
 from cnpgen.store.files.atomic import file_sha256
@@ -83,7 +81,7 @@ _PLAIN = tuple(
 )
 
 
-def record_to_json(record: ShardRecord) -> dict[str, Any]:
+def record_to_json(record: ShardRecord) -> JsonObject:
     """Return a record as a JSON-able dict."""
     return {
         **{name: getattr(record, name) for name in _PLAIN},
@@ -94,7 +92,7 @@ def record_to_json(record: ShardRecord) -> dict[str, Any]:
     }
 
 
-def record_from_json(content: Mapping[str, Any]) -> ShardRecord:
+def record_from_json(content: JsonMapping) -> ShardRecord:
     """Rebuild a record from the result of ``record_to_json``.
 
     A missing key or a wrong type raises DatasetError.
@@ -151,7 +149,7 @@ def commit_shard(
     spec: DatasetSpec,
     task: ShardTask,
     *,
-    columns: Mapping[str, NDArray[Any]],
+    columns: Mapping[str, AnyArray],
     sampling: SamplingStatistics,
     scenes: SceneTable | None = None,
     started: str = "",
@@ -197,7 +195,7 @@ def _write(
     folder: Path,
     spec: DatasetSpec,
     task: ShardTask,
-    columns: Mapping[str, NDArray[Any]],
+    columns: Mapping[str, AnyArray],
     scenes: SceneTable | None,
 ) -> int:
     """Check the scenes, write a shard, and return its number of bytes."""
@@ -224,8 +222,10 @@ def load_committed(folder: Path, spec: DatasetSpec, task: ShardTask) -> ShardRec
     """
     record = load_record(folder, task)
     if record.specification_fingerprint != spec.version_with(task).fingerprint:
-        text = f"{folder / task.sidecar} belongs to another specification ({record.specification_fingerprint[:12]}...)"
-        raise DatasetError(text)
+        raise DatasetError(
+            f"{folder / task.sidecar} belongs to another specification "
+            f"({record.specification_fingerprint[:12]}...)"
+        )
     path = folder / task.file
     # The size is a quick check; the sha256 is compared where rows are read.
     size = path.stat().st_size if path.is_file() else None

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from cnpgen.arrays import AnyArray, Integers, JsonMapping, JsonObject, Mask
 from cnpgen.errors import DatasetError
 from cnpgen.store.field import Field
 from cnpgen.store.files.document_structure import NUMBER, WHOLE, check_structure
@@ -45,10 +45,10 @@ class FieldStatistics:
     maximum: Floats
     low: Floats | None = None
     high: Floats | None = None
-    histogram: NDArray[np.int64] | None = None
+    histogram: Integers | None = None
 
     @property
-    def constant(self) -> NDArray[np.bool_]:
+    def constant(self) -> Mask:
         """Mask of the columns with one value in all rows, shape (c,).
 
         Their standard deviation is 0.
@@ -89,9 +89,9 @@ class FieldStatistics:
             else self.histogram + other.histogram,
         )
 
-    def to_json(self) -> dict[str, Any]:
+    def to_json(self) -> JsonObject:
         """Return a JSON-able dict, which also contains the derived ``std`` and ``constant``."""
-        content: dict[str, Any] = {"count": self.count}
+        content: JsonObject = {"count": self.count}
         for name in ("mean", "std", "m2", "minimum", "maximum", "constant"):
             content[{"minimum": "min", "maximum": "max"}.get(name, name)] = getattr(
                 self, name
@@ -120,7 +120,7 @@ STATISTICS_STRUCTURE = {
 _HISTOGRAM_STRUCTURE = {"low": [NUMBER], "high": [NUMBER], "counts": [[WHOLE]]}
 
 
-def statistics_from_json(content: Mapping[str, Any]) -> FieldStatistics:
+def statistics_from_json(content: JsonMapping) -> FieldStatistics:
     """Rebuild statistics from ``STATISTICS_STRUCTURE``.
 
     Inconsistent shapes or counts raise ValueError.
@@ -157,7 +157,7 @@ def are_of(statistics: Mapping[str, FieldStatistics], fields: Sequence[Field]) -
     return columns == {field.name: max(field.width, 1) for field in fields}
 
 
-def field_statistics(values: NDArray[Any], field: Field) -> FieldStatistics:
+def field_statistics(values: AnyArray, field: Field) -> FieldStatistics:
     """Compute the statistics of the columns of one field from at least one row, shape (rows, width) or (rows,).
 
     Histograms need two finite limits.
@@ -199,7 +199,7 @@ def _limits(field: Field, columns: int) -> tuple[Floats, Floats] | tuple[None, N
     )
 
 
-def _histogram(columns: Floats, low: Floats, high: Floats) -> NDArray[np.int64]:
+def _histogram(columns: Floats, low: Floats, high: Floats) -> Integers:
     """Count the rows of every column, shape (c, rows), in its bins, shape (c, 64)."""
     # A column with equal limits has all rows in one bin.
     width = np.where(high > low, high - low, 1.0)
@@ -211,7 +211,7 @@ def _histogram(columns: Floats, low: Floats, high: Floats) -> NDArray[np.int64]:
 
 
 def column_statistics(
-    columns: Mapping[str, NDArray[Any]], fields: Sequence[Field]
+    columns: Mapping[str, AnyArray], fields: Sequence[Field]
 ) -> dict[str, FieldStatistics]:
     """Compute the statistics of every field, in the order of the fields."""
     return {

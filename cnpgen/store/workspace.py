@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
-from cnpgen.errors import DatasetError, MachineError, UsageError
+from cnpgen.errors import DatasetError, MachineError, UsageError, counted
 from cnpgen.store.dataset_spec import (
     INFORMATIONAL,
     DatasetSpec,
@@ -111,8 +111,10 @@ def started_spec(workspace: Workspace, wanted: DatasetSpec) -> DatasetSpec | Non
             f"{workspace.damage}; {{force}} replaces the whole dataset",
             remedies={"force": True},
         )
-    text = f"{workspace.folder} {_describe_conflict(existing, wanted)}"
-    raise UsageError(text, remedies={"out": None, "force": True})
+    raise UsageError(
+        f"{workspace.folder} {_describe_conflict(existing, wanted)}",
+        remedies={"out": None, "force": True},
+    )
 
 
 def open_workspace(
@@ -148,8 +150,9 @@ def require_dataset_spec(folder: Path, spec: DatasetSpec) -> None:
         is_unchanged = spec.fingerprint.encode() in read_file(folder / SPECIFICATION)
     except DatasetError as error:
         missing = f"its {SPECIFICATION}" if folder.is_dir() else "it"
-        text = f"{folder}: {missing} was deleted or moved while the dataset was made; make it again"
-        raise MachineError(text) from error
+        raise MachineError(
+            f"{folder}: {missing} was deleted or moved while the dataset was made; make it again"
+        ) from error
     if not is_unchanged:
         raise _other_folder(
             f"{folder} was replaced by another dataset while this one was made"
@@ -228,7 +231,7 @@ def _setting(difference: Difference) -> str:
 
 def _sizes(spec: DatasetSpec) -> str:
     splits = ", ".join(f"{split} {rows:,}" for split, rows in spec.splits.items())
-    return f"{sum(spec.splits.values()):,} rows ({splits})"
+    return f"{counted(sum(spec.splits.values()), 'row')} ({splits})"
 
 
 def _cleared(workspace: Workspace) -> Workspace:
@@ -265,8 +268,10 @@ def check_clearable(workspace: Workspace) -> list[Path]:
         named = [folder / split for split in spec.splits]
     splits = [split for split in named if split.is_dir()]
     if foreign := _foreign(folder, splits):
-        text = f"{folder} holds {foreign.relative_to(folder)}, which is not part of the dataset: move it away first"
-        raise UsageError(text)
+        raise UsageError(
+            f"{folder} holds {foreign.relative_to(folder)}, which is not part of the dataset: move it "
+            "away first"
+        )
     return splits
 
 

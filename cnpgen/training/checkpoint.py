@@ -3,15 +3,12 @@
 import json
 import math
 import time
-from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from cnpgen.arrays import AnyArray
+from cnpgen.arrays import AnyArray, JsonMapping, JsonObject, Mask
 from cnpgen.errors import DatasetError, UsageError
 from cnpgen.store.files.checksum_file import (
     Content,
@@ -62,7 +59,7 @@ class Sums:
         Plans without a finite loss are counted and omitted.
         """
         # Plans whose loss is not finite are counted, not averaged.
-        finite: NDArray[np.bool_] = np.asarray(np.isfinite(terms).all(axis=1))
+        finite: Mask = np.asarray(np.isfinite(terms).all(axis=1))
         if finite.any():
             self.terms += terms[finite].mean(axis=0, dtype=np.float64)
         self.lost += int(len(finite) - finite.sum())
@@ -92,7 +89,7 @@ class State:
     best: Best
     steps: int
     imitating: int = 0
-    metric: Mapping[str, Any] = field(default_factory=dict)
+    metric: JsonMapping = field(default_factory=dict)
     seconds: float = 0.0
     checking: float = 0.0
     log: list[str] = field(default_factory=list)
@@ -180,11 +177,11 @@ def from_content(content: Content) -> State:
 class Checkpoints:
     """Checkpoints of one run in a file, written at intervals, with its JSON-able settings, dataset and steps."""
 
-    def __init__(self, path: Path, identity: Mapping[str, Any]) -> None:
+    def __init__(self, path: Path, identity: JsonMapping) -> None:
         self.path = path
         # In the form in which it is read back, so that equal identities compare as
         # equal.
-        self.identity: dict[str, Any] = json.loads(json.dumps(identity))
+        self.identity: JsonObject = json.loads(json.dumps(identity))
         self._next = time.monotonic() + MIN_INTERVAL_S
 
     def load(self, *, discard: bool = False) -> State | None:

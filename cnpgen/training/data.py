@@ -7,11 +7,10 @@ from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
-from cnpgen.arrays import Array
+from cnpgen.arrays import Array, JsonObject
 from cnpgen.errors import DatasetError, UsageError
 from cnpgen.loader.dataset import Dataset
 from cnpgen.loader.load import load_dataset
@@ -45,7 +44,7 @@ class TrainingData(ABC):
 
     problem: StoredProblem
     place: str
-    stages: list[dict[str, Any]]
+    stages: list[JsonObject]
     n_validation: int
 
     @abstractmethod
@@ -53,7 +52,7 @@ class TrainingData(ABC):
         """Read all training rows."""
 
     @abstractmethod
-    def describe(self) -> dict[str, Any]:
+    def describe(self) -> JsonObject:
         """Return the identity of the rows, for the model's file."""
 
     def demonstrations(self, joints: int) -> ControlPoints | None:  # noqa: ARG002 - used by datasets
@@ -115,7 +114,7 @@ class DatasetRows(TrainingData):
         path, rate = (columns[name] for name in DEMONSTRATION)
         return ControlPoints(path.reshape(len(path), -1, joints), rate)
 
-    def describe(self) -> dict[str, Any]:
+    def describe(self) -> JsonObject:
         """Return the identity of the dataset."""
         spec = self.dataset.spec
         return {
@@ -174,7 +173,7 @@ class SceneRows(TrainingData):
         rows = slice(offset + first, offset + stop)
         return TrainingProblems(self.boundary[rows], self.obstacle_poses[rows])
 
-    def describe(self) -> dict[str, Any]:
+    def describe(self) -> JsonObject:
         """Return the identity of the problems."""
         digest = hashlib.sha256()
         for values in (

@@ -1,10 +1,10 @@
 """Training log, one JSON object per line, in a file to follow the run and in the checkpoint; its learning curve."""
 
 import json
-from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
+from cnpgen.arrays import JsonMapping, JsonObject
 from cnpgen.errors import UsageError
 from cnpgen.store.files.atomic import committing, write_file
 from cnpgen.store.files.documents import parse_json
@@ -29,7 +29,7 @@ class TrainingLog:
         self.lines = lines
         write_file(path, self.text)
 
-    def write(self, record: Mapping[str, Any]) -> None:
+    def write(self, record: JsonMapping) -> None:
         """Append a record."""
         line = json.dumps(record, allow_nan=False)
         self.lines.append(line)
@@ -77,7 +77,7 @@ def plot_curve(log: str, path: str | Path) -> None:
         figure.savefig(temporary, format=Path(path).suffix.removeprefix("."))
 
 
-def _draw_violations(axis: "Axes", steps: list[dict[str, Any]]) -> None:
+def _draw_violations(axis: "Axes", steps: list[JsonObject]) -> None:
     """Draw the mean violations over their budgets in the problem file, or as they are if none has a budget."""
     seconds = _column(steps, "seconds")
     budgets = steps[0].get("budgets", {})
@@ -91,7 +91,7 @@ def _draw_violations(axis: "Axes", steps: list[dict[str, Any]]) -> None:
     axis.legend(fontsize=8)
 
 
-def _draw_validity(axis: "Axes", checks: list[dict[str, Any]]) -> None:
+def _draw_validity(axis: "Axes", checks: list[JsonObject]) -> None:
     seconds = _column(checks, "seconds")
     for name, label in (
         ("valid", "strict verdict"),
@@ -109,5 +109,5 @@ def _draw_validity(axis: "Axes", checks: list[dict[str, Any]]) -> None:
     axis.legend(fontsize=8)
 
 
-def _column(records: list[dict[str, Any]], name: str) -> list[float]:
+def _column(records: list[JsonObject], name: str) -> list[float]:
     return [record[name] for record in records]

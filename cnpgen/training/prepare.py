@@ -7,17 +7,16 @@ import math
 import time
 from dataclasses import asdict, replace
 from functools import partial
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from cnpgen.arrays import AnyArray, JsonObject
 from cnpgen.errors import UsageError
 from cnpgen.losses.margins import Margins, suggested_margins
 from cnpgen.losses.metric import Metric, suggested_weights
 from cnpgen.losses.plan_loss import PlanLoss
 from cnpgen.machine.versions import __version__
-from cnpgen.planner.control_points import Projection, make_projection
+from cnpgen.planner.control_points import make_projection
 from cnpgen.planner.inference_pipeline import (
     InferencePipeline,
     LoadedProblem,
@@ -79,8 +78,7 @@ def prepare_run(
     config, blocks, features = _inputs(loaded, settings, boundary, initial_model)
     inference = _inference(loaded, config, boundary, zero, blocks)
     architecture = _architecture(loaded, settings, blocks, boundary)
-    if initial_model is not None:
-        _check_initial_model(initial_model, architecture, settings, loaded, zero)
+    _check_initial_model(initial_model, architecture, settings, loaded, zero)
     rows, features = _rows(problems, inference, blocks, features, initial_model)
     rows = _with_demonstrations(rows, source, loaded) if settings.imitation else rows
     make_model = partial(
@@ -93,18 +91,15 @@ def prepare_run(
         training=_record(source, settings, command, rows, initial_model),
     )
     loss = _loss(loaded, settings)
-    held_out = source.checked(check_rows)
     spec = loaded.problem.trajectory
-    along = inference.prepare.along
-    projection = _projection(loaded, settings, boundary.fixed_at_goal)
+    learner = Learner(architecture, spec, loss, settings, features=features)
     run = Run(
-        Learner(architecture, spec, loss, settings, projection, along, features),
-        names=loss.terms,
-        budgets=dict(zip(loss.terms[1:], loss.budgets.tolist(), strict=True)),
+        _with_projection(learner, loaded, inference, boundary.fixed_at_goal),
+        loss=loss,
         rows=rows,
         metric=_metric(loss, settings),
         model=lambda values: make_model(parameters=values.astype(np.float32)),
-        validate=lambda model: validate(model, inference, held_out),
+        validate=partial(validate, inference, source.checked(check_rows)),
         initial_parameters=None if initial_model is None else initial_model.parameters,
     )
     return run, inference
@@ -166,16 +161,21 @@ def _rows(
     )
 
 
-def _projection(
-    loaded: LoadedProblem, settings: TrainingSettings, fixed_at_goal: int
-) -> Projection | None:
-    return make_projection(
+def _with_projection(
+    learner: Learner,
+    loaded: LoadedProblem,
+    inference: InferencePipeline,
+    fixed_at_goal: int,
+) -> Learner:
+    """Return a learner that projects paths onto the equalities, and that has tasks along the projected lines."""
+    projection = make_projection(
         loaded.problem.for_planning,
         loaded.kernels,
-        steps=settings.projection_steps,
+        steps=learner.settings.projection_steps,
         fixed_at_goal=fixed_at_goal,
-        within_limits=settings.within_limits,
+        within_limits=learner.settings.within_limits,
     )
+    return replace(learner, projection=projection, along=inference.prepare.along)
 
 
 def _initial_features(
@@ -194,7 +194,7 @@ def _initial_features(
     )
 
 
-def identity(source: TrainingData, settings: TrainingSettings) -> dict[str, Any]:
+def identity(source: TrainingData, settings: TrainingSettings) -> JsonObject:
     """Return the identity of a run without its length; JSON-able."""
     return {
         "cnpgen": __version__,
@@ -209,7 +209,7 @@ def _record(
     command: str,
     rows: Rows,
     initial_model: Model | None,
-) -> dict[str, Any]:
+) -> JsonObject:
     """Return what a model's file states of its run; JSON-able."""
     return {
         "command": command,
@@ -220,7 +220,7 @@ def _record(
 
 
 def input_ranges(
-    inputs: NDArray[Any], initial_model: Model | None = None
+    inputs: AnyArray, initial_model: Model | None = None
 ) -> dict[str, list[float]]:
     """Return the smallest and largest inputs of the network in the training rows, shape (N, F), with eight digits.
 
@@ -261,13 +261,15 @@ def _with_demonstrations(
 
 
 def _check_initial_model(
-    model: Model,
+    model: Model | None,
     architecture: Architecture,
     settings: TrainingSettings,
     loaded: LoadedProblem,
     zero: tuple[str, ...],
 ) -> None:
-    """Raise an error if the model's parameters cannot be used in this run."""
+    """Raise an error if the parameters of an initial model cannot be used in this run."""
+    if model is None:
+        return
     if model.problem.comparable_sha256 != loaded.record.comparable_sha256:
         differs = ", ".join(loaded.record.differences(model.problem)[:4])
         raise UsageError(
@@ -288,7 +290,7 @@ def _check_initial_model(
 
 def _parameter_definition(
     architecture: Architecture, config: ModelConfig, zero: tuple[str, ...]
-) -> dict[str, Any]:
+) -> JsonObject:
     """Return the values that must agree for parameters to be interchangeable."""
     outputs = {
         "path_scale": config.path_scale,
@@ -375,7 +377,7 @@ def _fresh(run: Run, steps: int) -> State:
             rate_bias=settings.rate_bias,
         )
     return start_state(
-        parameters, terms=len(run.names), steps=steps, imitation=settings.imitation
+        parameters, terms=len(run.loss.terms), steps=steps, imitation=settings.imitation
     )
 
 
@@ -398,12 +400,12 @@ def _step_seconds(run: Run) -> float:
 
 
 def validate(
-    model: Model,
     inference: InferencePipeline,
     problems: TrainingProblems,
+    model: Model,
     *,
     workers: int | None = 1,
-) -> dict[str, Any]:
+) -> JsonObject:
     """Plan for N validation rows and judge the plans in some processes.
 
     Returns:

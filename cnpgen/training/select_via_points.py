@@ -3,9 +3,8 @@
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
-from cnpgen.arrays import Array
+from cnpgen.arrays import Array, Mask
 from cnpgen.errors import UsageError
 from cnpgen.machine.threads import one_thread
 from cnpgen.planner.inference_pipeline import (
@@ -86,7 +85,7 @@ def _planned(
     inference: InferencePipeline,
     boundary: Boundary,
     via_point: Array | None = None,
-) -> tuple[Motion, NDArray[np.bool_]]:
+) -> tuple[Motion, Mask]:
     """Plan, along lines through via points if given.
 
     Return the motions and a mask of those without violation.
@@ -98,7 +97,7 @@ def _planned(
     return motion, inference.via_points.violation(motion, tasks.scene.poses) <= 1
 
 
-def _greedy_cover(repaired: NDArray[np.bool_], count: int) -> list[int]:
+def _greedy_cover(repaired: Mask, count: int) -> list[int]:
     """Return rows of a table whose union has most columns, selected greedily."""
     selected = list[int]()
     remaining = np.ones(repaired.shape[1], bool)

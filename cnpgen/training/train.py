@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+from cnpgen.arrays import JsonMapping, JsonObject
 from cnpgen.errors import DatasetError, UsageError
 from cnpgen.machine.threads import one_thread
 from cnpgen.machine.times import NO_TIME, Stopwatch, Times
@@ -59,7 +59,7 @@ class Trained:
 
     model: Model
     path: Path
-    score: Mapping[str, Any]
+    score: JsonMapping
     made: bool = True
     times: Times = NO_TIME
 
@@ -117,7 +117,7 @@ def train_model(
     settings = settings or TrainingSettings()
     lengths = {"steps": steps, "epochs": chosen.epochs, "cpu_seconds": cpu_seconds}
     stated = {name: value for name, value in lengths.items() if value is not None}
-    passed: dict[str, Any] = stated or {"cpu_seconds": DEFAULT_CPU_TIME_S}
+    passed: JsonObject = stated or {"cpu_seconds": DEFAULT_CPU_TIME_S}
     check_rows = integer("check_rows", check_rows, least=1)
     check_out(out)
     remove_temporary_files(out)
@@ -196,7 +196,7 @@ def _train(
         # Other rows than those that selected the best model, so that the score has no
         # selection bias.
         rows = request.source.judged(MAX_SCORED_ROWS, after=request.check_rows)
-        score = validate(best, inference, rows, workers=workers)
+        score = validate(inference, rows, best, workers=workers)
         model = _save(best, request, state, log, score)
     clock.computed_here()
     return Trained(model, out, score, times=clock.times())
@@ -207,7 +207,7 @@ def _save(
     request: _TrainingRequest,
     state: State,
     log: TrainingLog,
-    score: Mapping[str, Any],
+    score: JsonMapping,
 ) -> Model:
     """Save the best model with its log and its score in place of the checkpoint; return it."""
     # The checkpoint lacks this line, so that it is written once.
@@ -230,7 +230,7 @@ def _read_initial_model(
         return load_model(start_from), file_sha256(find_model(start_from))
 
 
-def _finished(path: Path, identity: Mapping[str, Any]) -> Trained:
+def _finished(path: Path, identity: JsonMapping) -> Trained:
     """Return the existing model if it is of the same run."""
     hint = "train another file, or replace it with {force}"
     try:
@@ -249,7 +249,7 @@ def _finished(path: Path, identity: Mapping[str, Any]) -> Trained:
     return Trained(model, path, model.training["score"], made=False)
 
 
-def _outcome(state: State, score: Mapping[str, Any]) -> dict[str, Any]:
+def _outcome(state: State, score: JsonMapping) -> JsonObject:
     """Return steps, times and score of a run, for the model's file."""
     return {
         "steps": state.adam.step,

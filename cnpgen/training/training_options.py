@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
+from cnpgen.arrays import JsonMapping
 from cnpgen.schema.argument_types import check_fields
 
 
@@ -29,7 +29,7 @@ class TrainingOptions:
     command: str = ""
     robot: str | Path | None = None
     begin: Callable[..., None] | None = None
-    watch: Callable[[Mapping[str, Any]], None] | None = None
+    watch: Callable[[JsonMapping], None] | None = None
 
     def __post_init__(self) -> None:
         check_fields(self)

@@ -4,9 +4,8 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
-from cnpgen.arrays import AnyArray
+from cnpgen.arrays import AnyArray, Columns, Indices, Integers
 from cnpgen.loader.windows import Order
 from cnpgen.planner.control_points import ControlPoints
 from cnpgen.planner.network.features import Features, feature_blocks, fit_features
@@ -29,7 +28,7 @@ class Rows:
     def __len__(self) -> int:
         return len(self.features)
 
-    def take(self, which: NDArray[np.intp]) -> "Rows":
+    def take(self, which: Indices) -> "Rows":
         """Return a subset of the rows."""
         target = (
             None
@@ -82,7 +81,7 @@ def prepare_rows(
         (straight(boundary[part], obstacle_poses=own) for part, own in pairs),
         blocks or feature_blocks(boundary, placed=placed),
     )
-    arrays: dict[str, AnyArray] = {}
+    arrays: Columns = {}
     for part, own in pairs:
         rows = boundary[part]
         tasks = prepare(rows, obstacle_poses=own) if lines is None else lines(rows)
@@ -98,7 +97,7 @@ def prepare_rows(
     return Rows(tasks, row_features), definition
 
 
-def _arrays(tasks: Tasks, features: Features, dtype: str) -> dict[str, AnyArray]:
+def _arrays(tasks: Tasks, features: Features, dtype: str) -> Columns:
     """Return all arrays of a block of rows with one entry per task, by name."""
     arrays = tasks.boundary.arrays()
     parts = {
@@ -137,9 +136,9 @@ class StepRows:
         self._rows = rows
         self._seed = seed
         self._epoch = -1
-        self._order: NDArray[np.int64] = np.empty(0, np.int64)
+        self._order: Integers = np.empty(0, np.int64)
 
-    def batch(self, step: int) -> NDArray[np.int64]:
+    def batch(self, step: int) -> Integers:
         """Return the rows of the batch of one step, shape (batch_size,)."""
         # The order of an epoch follows from seed and epoch, so that a resumed run
         # continues it.

@@ -1,15 +1,15 @@
 """A training run: steps, log, validation, checkpoints, and selection of the best model."""
 
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
-from cnpgen.arrays import AnyArray
+from cnpgen.arrays import AnyArray, JsonMapping, JsonObject
 from cnpgen.errors import MachineError
 from cnpgen.losses.metric import Metric
+from cnpgen.losses.plan_loss import PlanLoss
 from cnpgen.losses.quadrature import rotating_shift
 from cnpgen.machine.signals import signals_deferred
 from cnpgen.planner.model import Model
@@ -19,7 +19,7 @@ from cnpgen.training.log import TrainingLog
 from cnpgen.training.step import Learner
 from cnpgen.training.training_rows import Rows, StepRows
 
-Watcher = Callable[[Mapping[str, Any]], None]
+Watcher = Callable[[JsonMapping], None]
 
 LOG_LINES = 100  # per run
 # Between the shifts of successive steps; coprime to the number of shifts.
@@ -30,7 +30,7 @@ SHIFT_STRIDE = 7
 class Run:
     """One run.
 
-    ``budgets`` maps a term of the loss to its acceptable value, from the problem file.
+    ``loss`` has the terms and their acceptable values, from the problem file.
     ``metric`` has the weights of the constraint terms. ``model`` makes a model of
     parameters. ``validate`` scores it: a record for the log with a ``score``, the
     larger the better. Without ``initial_parameters``, they are random. ``order`` is the
@@ -38,12 +38,11 @@ class Run:
     """
 
     learner: Learner
-    names: tuple[str, ...]
-    budgets: Mapping[str, float]
+    loss: PlanLoss
     rows: Rows
     metric: Metric
     model: Callable[[AnyArray], Model]
-    validate: Callable[[Model], Mapping[str, Any]]
+    validate: Callable[[Model], JsonMapping]
     initial_parameters: AnyArray | None = None
 
     def __post_init__(self) -> None:
@@ -132,7 +131,7 @@ class Run:
             warm_up=settings.warm_up,
         )
 
-    def _due(self, state: State) -> list[dict[str, Any]]:
+    def _due(self, state: State) -> list[JsonObject]:
         """Return the records of the log that are due after this step."""
         step = state.adam.step
         records = []
@@ -142,7 +141,7 @@ class Run:
             records.append(self._check(state))
         return records
 
-    def _progress(self, state: State) -> dict[str, Any]:
+    def _progress(self, state: State) -> JsonObject:
         """Return the means of the terms since the last line."""
         sums = state.sums
         step = state.adam.step
@@ -163,18 +162,20 @@ class Run:
             "lost": sums.lost,
         }
 
-    def _means(self, state: State, sums: Sums) -> dict[str, Any]:
+    def _means(self, state: State, sums: Sums) -> JsonObject:
         means = sums.terms / sums.steps
+        # The first term is that of the task.
+        constraints = self.loss.terms[1:]
         weights = self.metric.weights(state.progress(state.adam.step - 1))
         return {
             # L = task loss + sum of weight times constraint term
             "loss": float(means[0] + means[1:] @ weights),
-            "terms": dict(zip(self.names, means.tolist(), strict=True)),
-            "weights": dict(zip(self.names[1:], weights.tolist(), strict=True)),
-            "budgets": dict(self.budgets),
+            "terms": dict(zip(self.loss.terms, means.tolist(), strict=True)),
+            "weights": dict(zip(constraints, weights.tolist(), strict=True)),
+            "budgets": dict(zip(constraints, self.loss.budgets.tolist(), strict=True)),
         }
 
-    def _check(self, state: State) -> dict[str, Any]:
+    def _check(self, state: State) -> JsonObject:
         """Validate the averaged parameters; keep them if they are the best so far."""
         started = time.process_time()
         step = state.adam.step

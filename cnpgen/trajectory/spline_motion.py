@@ -74,16 +74,16 @@ class Motion:
 
     def __post_init__(self) -> None:
         try:
-            path = np.shape(self.path)
-            rate = np.shape(self.rate)
+            arrays = np.asarray(self.path), np.asarray(self.rate)
         except ValueError as error:
             # Rows of different lengths.
             raise UsageError(
                 f"control points must be arrays: {error}", concerns="path"
             ) from error
-        for name in ("path", "rate"):
-            if np.asarray(getattr(self, name)).dtype.kind not in "fiu":
+        for name, array in zip(("path", "rate"), arrays, strict=True):
+            if array.dtype.kind not in "fiu":
                 raise UsageError("must be an array of numbers", argument=name)
+        path, rate = (array.shape for array in arrays)
         if len(path) != 3 or len(rate) != 2 or path[0] != rate[0]:
             raise UsageError(
                 f"control points must have shapes (N, C, n) and (N, R), got {path} and {rate}",

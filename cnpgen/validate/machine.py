@@ -13,8 +13,8 @@ import warnings
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Any
 
+from cnpgen.arrays import JsonObject
 from cnpgen.errors import PluginError, counted
 from cnpgen.machine.threads import users_environment
 from cnpgen.machine.versions import installed_version, processor_entry
@@ -116,7 +116,7 @@ class MachineReport:
         """Whether there are no problems."""
         return not self.problems
 
-    def to_dict(self) -> dict[str, Any]:
+    def to_dict(self) -> JsonObject:
         """Return the report for JSON."""
         return {"ok": self.ok, **asdict(self)}
 

@@ -3,10 +3,10 @@
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
+from cnpgen.arrays import JsonObject
 from cnpgen.errors import DatasetError, MachineError, UsageError, counted
 from cnpgen.judges.rows.row_report import RowReport
 from cnpgen.kernels.library import Backend, choose_backend
@@ -107,7 +107,7 @@ def backend_of(folder: Path, spec: DatasetSpec) -> tuple[Backend, Path]:
         ) from error
 
 
-def _compare(stored: dict[str, Any], again: dict[str, Any]) -> tuple[bool, str]:
+def _compare(stored: JsonObject, again: JsonObject) -> tuple[bool, str]:
     """Return whether the values are bitwise identical, and the first difference above the tolerance."""
     same = all(np.array_equal(stored[name], values) for name, values in again.items())
     for name, values in again.items():
@@ -181,7 +181,7 @@ class ValidationReport:
         """Whether there are no findings except for notes."""
         return all(finding.note for finding in self.findings)
 
-    def to_dict(self) -> dict[str, Any]:
+    def to_dict(self) -> JsonObject:
         """Return the report for JSON."""
         return {
             "folder": str(self.folder),

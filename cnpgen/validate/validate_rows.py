@@ -5,11 +5,11 @@ from contextlib import closing
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from cnpgen.arrays import AnyArray, Array, Indices
 from cnpgen.errors import CnpgenError, counted
 from cnpgen.judges.rows.hits import hit_rule, repeated_fraction, speed_fractions
 from cnpgen.judges.rows.row_report import RowReport, merge
@@ -101,7 +101,7 @@ class _ShardCheck:
     problems: list[str]
     keys: NDArray[np.uint64]
     plans: PlanCheck
-    fractions: NDArray[np.float64]
+    fractions: Array
     goals: NDArray[np.uint64]
 
 
@@ -160,7 +160,7 @@ def _check_speed_fractions(spec: DatasetSpec, checks: list[_ShardCheck]) -> list
     )
 
 
-def row_keys(values: NDArray[Any]) -> NDArray[np.uint64]:
+def row_keys(values: AnyArray) -> NDArray[np.uint64]:
     """Hash every row of numbers, shape (rows, width), to 64 bits.
 
     Equal rows have equal keys.
@@ -182,7 +182,7 @@ def row_keys(values: NDArray[Any]) -> NDArray[np.uint64]:
 def check_numbers(
     spec: DatasetSpec,
     task: ShardTask,
-    columns: Mapping[str, NDArray[Any]],
+    columns: Mapping[str, AnyArray],
     record: ShardRecord,
 ) -> list[str]:
     """Describe the problems of all rows of a shard, shape (rows, width) or (rows,), by specification and record."""
@@ -212,7 +212,7 @@ def check_numbers(
 
 
 def _check_range(
-    field: Field, values: NDArray[Any], task: ShardTask, dtype: str
+    field: Field, values: AnyArray, task: ShardTask, dtype: str
 ) -> Iterator[str]:
     for name, bound, sign in (
         ("valid_min", field.valid_min, 1.0),
@@ -231,7 +231,7 @@ def _check_range(
 
 
 def _check_statistics(
-    field: Field, values: NDArray[Any], record: ShardRecord
+    field: Field, values: AnyArray, record: ShardRecord
 ) -> Iterator[str]:
     recorded = record.statistics.get(field.name)
     if np.isfinite(values).all() and not (
@@ -240,7 +240,7 @@ def _check_statistics(
         yield f"the recorded statistics of {field.name} are not those of its values"
 
 
-def tolerance(bound: NDArray[np.float64], dtype: str) -> NDArray[np.float64]:
+def tolerance(bound: Array, dtype: str) -> Array:
     """Return the accepted violation of a bound by a stored number: the tolerance of limits plus float32 rounding."""
     size = np.abs(bound)
     rounding = (
@@ -249,7 +249,7 @@ def tolerance(bound: NDArray[np.float64], dtype: str) -> NDArray[np.float64]:
     return BOUNDARY_TOLERANCES[dtype]["limit"] * np.maximum(size, 1.0) + rounding
 
 
-def _rows_text(rows: NDArray[np.intp], task: ShardTask) -> str:
+def _rows_text(rows: Indices, task: ShardTask) -> str:
     return f"{len(rows)} of {task.rows} rows, the first one is row {task.first_row + int(rows[0])}"
 
 

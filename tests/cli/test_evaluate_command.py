@@ -341,7 +341,7 @@ def test_a_plan_file_may_have_any_suffix(
         (("--plan", "0"), "--plan needs --plot"),
         (
             ("--plot", "x.png", "--plan", "1"),
-            "has no plan 1: 1 plans are numbered from 0",
+            "has no plan 1: 1 plan, numbered from 0",
         ),
         (("--plot", "x.gif"), "ends in .png, .pdf or .svg"),
         (("--step", "0"), "expected a time above 0, such as 0.001 or 1ms; got '0'"),

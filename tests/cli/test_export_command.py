@@ -147,7 +147,7 @@ def test_a_plan_that_is_not_there_is_named_before_the_place_is_looked_at(
     code, _, err = run(hits, "--to", "csv", "--plan", "0,7")
     assert (code, err) == (
         2,
-        "cnpgen: error: there is no plan 7: 4 plans are numbered from 0\n",
+        "cnpgen: error: there is no plan 7: 4 plans, numbered from 0\n",
     )
 
 
@@ -247,7 +247,7 @@ def test_plans_that_cannot_be_sampled_are_named_and_the_others_written(
         (("--to", "csv", "--plan", "one"), "expected whole numbers"),
         (
             ("--to", "csv", "--plan", "4"),
-            "there is no plan 4: 4 plans are numbered from 0",
+            "there is no plan 4: 4 plans, numbered from 0",
         ),
         (("--to", "csv", "--sample", "3"), "has no plan of sample 3"),
     ],

@@ -77,6 +77,8 @@ WITHOUT_EFFECT = [
     ("plan airhockey-hit --n 2 --allow-large-angles", "--allow-large-angles is for"),
     ("validate {rows} --workers 2", "--workers needs --deep"),
     ("evaluate {rows} --plan 3", "--plan needs --plot"),
+    ("evaluate {rows} --list --json", "--list has no effect with --json"),
+    ("complete panda {rows} -o a.h5 --extrapolate", "--extrapolate has no effect on"),
     ("make-scenes --list --n 3", "--n has no effect with --list"),
     ("make-scenes tabletop --list", "FAMILY has no effect with --list"),
     ("benchmark --list --n 3", "--n has no effect with --list"),

@@ -9,6 +9,7 @@ import subprocess
 import sys
 import tomllib
 from collections.abc import Iterator
+from functools import cache
 from importlib.util import find_spec
 from pathlib import Path
 from types import ModuleType
@@ -17,6 +18,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from cnpgen.cli.docs_command import rendered_pages
 from cnpgen.make.make_dataset import make_dataset
 from cnpgen.problems.load_robot import load_robot
 from cnpgen.problems.problem_file import load_problem
@@ -28,14 +30,10 @@ from tests.examples import example_robots
 
 ROOT = Path(__file__).parents[2]
 README = ROOT / "README.md"
-# docs/conf.py writes these pages from the code.
-WRITTEN_BY_THE_SITE = {"api.md", "cli.md", "keys.md", "scene-elements.md"}
 PAGES = [
     README,
     *sorted(
-        page
-        for page in (ROOT / "docs").rglob("*.md")
-        if page.name not in WRITTEN_BY_THE_SITE
+        page for page in (ROOT / "docs").rglob("*.md") if page not in rendered_pages()
     ),
 ]
 PLUG_INS = ROOT / "docs" / "how-to" / "plug-ins.md"
@@ -77,6 +75,7 @@ def environment(folder: Path) -> dict[str, str]:
         "PATH": f"{binaries}{os.pathsep}{os.environ['PATH']}",
         "PYTHONPATH": os.pathsep.join(path for path in paths if path),
         "MPLBACKEND": "Agg",
+        **outputs.TERMINAL,
     }
 
 
@@ -85,13 +84,14 @@ def run(command: list[str], folder: Path, code: int = 0) -> str:
         command,
         cwd=folder,
         env=environment(folder),
-        capture_output=True,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
         text=True,
         timeout=HANGING,
         check=False,
     )
-    assert done.returncode == code, f"{command}\n{done.stdout}\n{done.stderr}"
-    return done.stdout if code == 0 else done.stdout + done.stderr
+    assert done.returncode == code, f"{command}\n{done.stdout}"
+    return done.stdout
 
 
 def test_every_block_says_what_it_is() -> None:
@@ -113,10 +113,24 @@ def needed(tmp_path_factory: pytest.TempPathFactory) -> Path:
     ).folder
 
 
+@cache
+def can_draw() -> bool:
+    """Return whether MuJoCo is installed and draws without a screen."""
+    program = (
+        "from cnpgen.addons.benchmark.simulator.execute import load_mujoco as load\n"
+        "load().Renderer(load().MjModel.from_xml_string('<mujoco/>')).close()"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", program], capture_output=True, check=False
+    )
+    return done.returncode == 0
+
+
 def runs_here(marks: dict[str, str]) -> bool:
     """Return whether this machine has what a block needs; .ci/run or the extended run has the rest."""
     return not (
         ("library" in marks and find_spec(marks["library"]) is None)
+        or ("display" in marks and not can_draw())
         or ("robots" in marks and example_robots.folder() is None)
         or ("program" in marks and shutil.which(marks["program"]) is None)
         # .ci/run runs these two in fresh environments.
@@ -156,7 +170,7 @@ def test_the_blocks_of_a_page_run_in_order(
             printed = run([sys.executable, "-c", text], tmp_path)
     for drawn, picture in outputs.drawn_pictures(page, tmp_path):
         imread = pytest.importorskip("matplotlib.image").imread
-        now, before = (imread(path) for path in (drawn, picture))
+        now, before = (imread(path)[..., :3] for path in (drawn, picture))
         assert now.shape == before.shape, picture
         difference = np.abs(now - before).mean()
         assert difference < MAX_DIFFERENCE, f"{picture}: run docs/outputs.py"
@@ -173,7 +187,7 @@ def test_an_output_block_shows_lines_of_the_output_in_their_order() -> None:
 
 
 WRITTEN = {
-    "bash": re.compile(r"(?:-o|--out|--plot|>) ([\w.-]+)"),
+    "bash": re.compile(r"(?:-o|--out|--plot|--image|>) ([\w.-]+)"),
     "python": re.compile(
         r'(?:save_plans\("|make_dataset\("[\w-]+", "|File\("(?=[^"]+", "w"))([\w.-]+)'
     ),

@@ -16,8 +16,13 @@ NOT_QUOTED = {
     "pinocchio_scipy",
     "process_memory",
     "refiner_problems",
+    "train_proposals",
 }
-NOT_QUOTED |= {"ipopt", "slsqp"}  # parts of benchmarks/refiner.py
+NOT_QUOTED |= {
+    "ipopt",
+    "numpy_transcription",
+    "slsqp",
+}  # parts of benchmarks/refiner.py
 # Parts of benchmarks/chunks.py, drives.py and episodes.py.
 NOT_QUOTED |= {"chunk_baselines", "chunk_loop", "drive_plant", "episode_programs"}
 

@@ -7,17 +7,14 @@ from numpy.typing import NDArray
 
 from cnpgen.arrays import Array
 from cnpgen.robots.observation.camera import Camera
-from cnpgen.robots.observation.primitives import (
-    KINDS,
-    Primitives,
-    signed_distances,
-)
+from cnpgen.robots.observation.primitives import KINDS, ConvexMesh, Primitives
 from cnpgen.robots.observation.surface_points import Seeds, mixed
 
 Values = NDArray[np.float32]
 # 2^32 / g and 2^32 / g^2 with g^3 = g + 1: low discrepancy
 STEPS = np.array([3242174889, 2447445414], np.uint32)
 MIN_RAY = 1e-9  # of the coordinates of a ray
+POINTS_PER_CHUNK = 65_536  # keeps the temporary arrays of one primitive in the cache
 
 
 def bodies_of(scenes: Primitives, index: int) -> Primitives:
@@ -86,6 +83,95 @@ def smallest_signed_distances(primitives: Primitives, points: Array) -> Array:
             out=smallest,
         )
     return smallest
+
+
+def signed_distances(primitives: Primitives, points: Array) -> Array:
+    """Compute the signed distances of P world points from M primitives [m], negative inside, shape (M, P)."""
+    distances = np.empty((len(primitives), len(points)))
+    for index in range(len(primitives)):
+        mesh = primitives.mesh(index)
+        kind = int(primitives.kinds[index])
+        size = primitives.sizes[index]
+        # Chunks of points whose temporary arrays fit the cache.
+        for first in range(0, len(points), POINTS_PER_CHUNK):
+            part = slice(first, first + POINTS_PER_CHUNK)
+            local = (points[part] - primitives.centers[index]) @ primitives.rotations[
+                index
+            ]
+            distances[index, part] = (
+                _mesh_distances(mesh, local) if mesh else _distance(kind, size, local)
+            )
+    return distances
+
+
+def _distance(kind: int, size: Array, local: Array) -> Array:
+    """Return the signed distances of points in the frame of a primitive, shape (P,)."""
+    if kind == 0:
+        return _outside_or_inside(np.abs(local) - size)
+    radius = size[0]
+    half = size[1]
+    if kind == 2:
+        radial = np.hypot(local[:, 0], local[:, 1]) - radius
+        return _outside_or_inside(
+            np.stack([radial, np.abs(local[:, 2]) - half], axis=1)
+        )
+    # half is 0 for a sphere
+    along = np.clip(local[:, 2], -half, half)
+    return np.asarray(
+        np.sqrt(local[:, 0] ** 2 + local[:, 1] ** 2 + (local[:, 2] - along) ** 2)
+        - radius
+    )
+
+
+def _outside_or_inside(gaps: Array) -> Array:
+    """Return the distance from a product of intervals, or of a disc and an interval, from the gap along each."""
+    # Outside: length of the vector of positive gaps; inside: the largest, negative gap.
+    outside = np.linalg.norm(np.maximum(gaps, 0), axis=1)
+    return np.asarray(np.where(outside > 0, outside, gaps.max(axis=1)))
+
+
+def _mesh_distances(mesh: ConvexMesh, points: Array) -> Array:
+    """Return the signed distances of points [m], shape (P, 3), negative inside, shape (P,)."""
+    # Inside a hull the largest plane distance is the depth; outside it is a lower
+    # bound.
+    distances: Array = (points @ mesh.planes[:, :3].T + mesh.planes[:, 3]).max(axis=1)
+    outside = distances > 0
+    distances[outside] = np.sqrt(_squared_distances(mesh, points[outside]))
+    return distances
+
+
+def _squared_distances(mesh: ConvexMesh, points: Array) -> Array:
+    """Return squared distances from the nearest triangle."""
+    smallest = np.full(len(points), np.inf)
+    for corner, first, second in mesh.triangles:
+        normal = np.cross(first, second)
+        # Edges in order around the triangle, so that ``normal x edge`` points
+        # inwards.
+        ends = (
+            (corner, first),
+            (corner + first, second - first),
+            (corner + second, -second),
+        )
+        offsets = [points - start for start, _ in ends]
+        above = [
+            offset @ np.cross(normal, edge) >= 0
+            for offset, (_, edge) in zip(offsets, ends, strict=True)
+        ]
+        # Over the triangle: distance from its plane; else from the nearest edge.
+        to_plane = (offsets[0] @ normal) ** 2 / (normal @ normal)
+        to_edges = [
+            _squared_from_segment(offset, edge)
+            for offset, (_, edge) in zip(offsets, ends, strict=True)
+        ]
+        squared = np.where(np.all(above, axis=0), to_plane, np.min(to_edges, axis=0))
+        np.minimum(smallest, squared, out=smallest)
+    return smallest
+
+
+def _squared_from_segment(offsets: Array, edge: Array) -> Array:
+    """Return squared distances from a segment of points relative to its start, shape (P,)."""
+    along = np.clip(offsets @ edge / (edge @ edge), 0, 1)
+    return np.asarray(((offsets - along[:, None] * edge) ** 2).sum(axis=1))
 
 
 def entries(planes: Array, origin: Array, rays: Array) -> Array:

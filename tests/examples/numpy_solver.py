@@ -1,12 +1,19 @@
 """The step of the solver in NumPy and DAQP: the reference of ``step.c`` and ``active_set.c``."""
 
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
 
 import numpy as np
 from numpy.typing import NDArray
+from numpy_transcription import (
+    Linearization,
+    evaluate,
+    linearization_errors,
+    regularized_values,
+    residual_gradients,
+)
 
-from cnpgen.arrays import Array
+from cnpgen.arrays import Array, Mask
 from cnpgen.refine.solver.bounds import Bounds
 from cnpgen.refine.solver.qp_subproblem import (
     ELASTIC_CURVATURE_ROOT,
@@ -15,12 +22,11 @@ from cnpgen.refine.solver.qp_subproblem import (
     MAX_WORKING_SET_CHANGES,
     MIN_MULTIPLIER,
     QP_TOLERANCE,
-    Mask,
     ResidualSelection,
     Step,
     local_maxima,
 )
-from cnpgen.refine.solver.transcription import Linearization, Transcription, cache_last
+from cnpgen.refine.solver.transcription import Transcription, cache_last
 
 Indices = NDArray[np.intp]
 DAQP_INFINITY = 1e30  # DAQP's value of no bound
@@ -33,11 +39,11 @@ class NumpyBackend:
     def __init__(self, motion: Transcription, bounds: Bounds) -> None:
         self._motion, self._bounds = motion, bounds
         # After a rejected step the iterate is the same.
-        self._evaluate = cache_last(motion.evaluate)
+        self._evaluate = cache_last(partial(evaluate, motion))
 
     def value(self, x: Array) -> tuple[float, Array, float]:
         """Evaluate the regularized objective, residuals (K, m) and their largest violation."""
-        cost, g = self._motion.value(x)
+        cost, g = regularized_values(self._motion, x)
         return cost, g, self._bounds.max_violation(g)
 
     def subproblem(
@@ -56,7 +62,7 @@ class NumpyBackend:
         at, bounds, distance = self._evaluate(x), self._bounds, selection.max_distance
         violations, errors = (
             bounds.violations(g),
-            self._motion.linearization_errors(at, selection.max_log_rate_change),
+            linearization_errors(self._motion, at, selection.max_log_rate_change),
         )
         distances = np.where(
             bounds.accelerated, distance, min(distance, MAX_SPEED_DISTANCE)
@@ -170,7 +176,9 @@ class NumpySubproblem:
         rows = np.zeros((nx + 1 + len(k), nx + 1))
         rows[:nx, :-1] = unwhiten
         np.matmul(
-            self.motion.rows(self.at, k, residual), unwhiten, out=rows[nx + 1 :, :-1]
+            residual_gradients(self.motion, self.at, k, residual),
+            unwhiten,
+            out=rows[nx + 1 :, :-1],
         )
         rows[nx, -1] = 1 / ELASTIC_CURVATURE_ROOT
         elastic = rows[nx + 1 :, -1]

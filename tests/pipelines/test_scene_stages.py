@@ -21,12 +21,13 @@ from cnpgen.pipelines.stages.scene_ends import (
 from cnpgen.pipelines.stages.stage import CandidateBatch, Context, load_context
 from cnpgen.problems.load_robot import load_robot
 from cnpgen.problems.obstacles import with_capacity
-from cnpgen.robots.observation.primitives import KINDS, primitives_of, signed_distances
+from cnpgen.robots.observation.primitives import KINDS, primitives_of
 from cnpgen.robots.scene import make_scene_table, scene_capacity
 from cnpgen.robots.solid import place_obstacles, solids_of
 from cnpgen.store.scene_table import OBSTACLE_KINDS
 from cnpgen.world.pose_ik import PoseKinematics
 from tests.conftest import needs_compiler
+from tests.examples.numpy_observations import signed_distances
 from tests.examples.obstacles import draw_obstacle
 from tests.examples.scene_arm import obstacles_of, write_scene_pipeline
 

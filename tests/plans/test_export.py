@@ -184,7 +184,7 @@ def test_of_the_plans_that_are_not_chosen_nothing_is_said(tmp_path: Path) -> Non
     for missing in (10, -1):
         with pytest.raises(
             UsageError,
-            match=f"there is no plan {missing}: 10 plans are numbered from 0",
+            match=f"there is no plan {missing}: 10 plans, numbered from 0",
         ):
             export_plans(garbage(), tmp_path, to="csv", only=[missing])
 

@@ -137,3 +137,24 @@ def test_values_that_change_after_the_check_are_found_when_plans_are_saved(
         with pytest.raises(UsageError, match=r"velocity_factor must be .* got 1\.3"):
             door()
     assert not (tmp_path / "a.h5").exists()
+
+
+def test_the_option_has_no_effect_without_parameters_and_is_refused(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    plans = cnpgen.complete("airhockey-hit", **TASK).plans
+    path = tmp_path / "plans.h5"
+    cnpgen.save_plans(path, plans)
+    for words in (
+        ["evaluate", str(path)],
+        ["refine", str(path), "-o", str(tmp_path / "r.h5")],
+        ["solve", str(path), "-o", str(tmp_path / "s.h5")],
+    ):
+        assert main([*words, "--extrapolate"]) == 2
+        text = "--extrapolate has no effect: the problem 'airhockey' has no parameters"
+        assert text in capsys.readouterr().err
+    options = LoadOptions(extrapolate=True)
+    samples = tmp_path / "a.csv"
+    samples.write_text("t,q1,q2,q3,q4,q5,q6\n0,0,0,0,0,0,0\n1,0,0,0,0,0,0\n")
+    with pytest.raises(UsageError, match="extrapolate has no effect"):
+        load_trajectories(samples, "airhockey", options=options)

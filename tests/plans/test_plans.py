@@ -857,7 +857,7 @@ def test_plans_that_do_not_fit_are_not_joined(
             np.ones(3, bool),
             r"a mask must have shape \(7,\) as there are 7 plans, got \(3,\)",
         ),
-        (np.array([0, 7]), "there is no plan 7: 7 plans are numbered from 0"),
+        (np.array([0, 7]), "there is no plan 7: 7 plans, numbered from 0"),
         (np.array([-8]), "there is no plan -8"),
         (7, "there is no plan 7"),
         (

@@ -4,16 +4,18 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-
-from benchmarks.ipopt import (
+from ipopt import (
     Program,
     lagrangian_hessian,
     minimize_with_ipopt,
     with_ipopt,
 )
+from numpy_transcription import evaluate, residual_gradients
+
 from cnpgen.refine import initial_guesses
 from cnpgen.refine.solver.bounds import Bounds
 from cnpgen.refine.solver.sqp import Settings
+from cnpgen.refine.solver.transcription import Transcription
 from tests.examples.plans import load
 from tests.examples.refiner import cost_term_of, refiner, task
 from tests.refine.test_solver import transcription
@@ -43,9 +45,9 @@ def test_a_level_ends_at_least_as_good_as_ipopts_from_the_same_guess(
 
 def gradient(motion, x: np.ndarray, multipliers: np.ndarray) -> np.ndarray:
     """Return the gradient of the Lagrangian without the objective."""
-    at = motion.evaluate(x)
+    at = evaluate(motion, x)
     k, residual = np.nonzero(np.ones(at.g.shape, bool))
-    return multipliers[k, residual] @ motion.rows(at, k, residual)
+    return multipliers[k, residual] @ residual_gradients(motion, at, k, residual)
 
 
 @pytest.mark.parametrize(
@@ -67,7 +69,7 @@ def test_the_hessian_of_the_lagrangian_is_that_of_finite_differences(
     x = motion.pack(plan.motion.path[0], plan.motion.rate[0]) + 0.02 * random.normal(
         size=motion.nx
     )
-    at = motion.evaluate(x)
+    at = evaluate(motion, x)
     multipliers = random.normal(size=at.g.shape) * (random.random(at.g.shape) < 0.3)
     multipliers[:, -2:] = 0  # of obstacles, whose distances are not smooth
     if label == "transport":
@@ -90,7 +92,7 @@ def test_the_hessian_of_the_lagrangian_is_that_of_finite_differences(
 def test_without_multipliers_only_the_objective_is_curved() -> None:
     plan = load("hit")
     motion = transcription(plan, 12, cost_term=cost_term_of("centrifugal", 0.01))
-    at = motion.evaluate(motion.pack(plan.motion.path[0], plan.motion.rate[0]))
+    at = evaluate(motion, motion.pack(plan.motion.path[0], plan.motion.rate[0]))
     np.testing.assert_array_equal(
         lagrangian_hessian(motion, at, np.zeros(at.g.shape), 3.0), 3.0 * at.curvature
     )
@@ -104,7 +106,7 @@ def test_a_program_has_the_selected_residuals_and_its_sparse_jacobian_equals_the
     plan = load("replan")
     motion = transcription(plan, 24)
     x = motion.pack(plan.motion.path[0], plan.motion.rate[0])
-    shape = motion.evaluate(x).g.shape
+    shape = evaluate(motion, x).g.shape
     selected = np.random.default_rng(0).random(shape) < 0.2
     bounds = Bounds(
         np.full(shape, -1.0),
@@ -122,7 +124,8 @@ def test_a_program_has_the_selected_residuals_and_its_sparse_jacobian_equals_the
     elsewhere = x + 0.05 * np.random.default_rng(1).normal(size=len(x))
     found = derivative(elsewhere)
     np.testing.assert_array_equal(
-        np.array(found), motion.rows(motion.evaluate(elsewhere), *np.nonzero(selected))
+        np.array(found),
+        residual_gradients(motion, evaluate(motion, elsewhere), *np.nonzero(selected)),
     )
     assert found.nnz() < 0.5 * found.numel()
 
@@ -130,18 +133,15 @@ def test_a_program_has_the_selected_residuals_and_its_sparse_jacobian_equals_the
 def test_an_error_while_ipopt_runs_is_raised(monkeypatch: pytest.MonkeyPatch) -> None:
     problem, tool = task(load("hit")), refiner("airhockey")
     level, calls = tool.levels.coarse, []
-    motion, evaluate = (
-        tool.transcription(problem, level),
-        tool.transcription(problem, level).evaluate,
-    )
+    motion = tool.transcription(problem, level)
 
-    def fail(x: np.ndarray) -> object:
+    def fail(of: Transcription, x: np.ndarray) -> object:
         calls.append(x)
         if len(calls) > 6:
             raise KeyboardInterrupt
-        return evaluate(x)
+        return evaluate(of, x)
 
-    monkeypatch.setattr(motion, "evaluate", fail)
+    monkeypatch.setattr("ipopt.evaluate", fail)
     bounds = tool.bounds(problem, level, motion.end_residuals())
     with pytest.raises(KeyboardInterrupt):
         minimize_with_ipopt(motion, bounds, tool.line_guess(problem), Settings())

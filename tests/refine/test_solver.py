@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from numpy_transcription import evaluate, regularized_values, residual_gradients
 
 from cnpgen.errors import UsageError
 from cnpgen.judges.plans import Verdict
@@ -130,13 +131,13 @@ def test_gradients_of_residuals_and_objective_are_those_of_finite_differences(
     x = motion.pack(plan.motion.path[0], plan.motion.rate[0]) + 0.02 * random.normal(
         size=motion.nx
     )
-    at = motion.evaluate(x)
+    at = evaluate(motion, x)
     k, residual = np.nonzero(np.ones(at.g.shape, bool))
-    rows = motion.rows(at, k, residual)
+    rows = residual_gradients(motion, at, k, residual)
     step = 1e-6
     for variable in random.choice(motion.nx, 12, replace=False):
         up, down = (
-            motion.value(x + sign * step * np.eye(motion.nx)[variable])
+            regularized_values(motion, x + sign * step * np.eye(motion.nx)[variable])
             for sign in (1, -1)
         )
         gradient = (up[1] - down[1]).ravel() / (2 * step)
@@ -146,14 +147,16 @@ def test_gradients_of_residuals_and_objective_are_those_of_finite_differences(
         assert at.gradient[variable] == pytest.approx(
             expected, abs=1e-7 * (1 + np.abs(at.gradient).max())
         )
-    assert at.cost == pytest.approx(motion.value(x)[0], rel=1e-13)
+    assert at.cost == pytest.approx(regularized_values(motion, x)[0], rel=1e-13)
     assert np.linalg.eigvalsh(at.curvature).min() > -1e-9 * np.abs(at.curvature).max()
 
 
 def test_residuals_are_the_scaled_constraints_of_the_problem() -> None:
     plan = load("hit")
     motion = transcription(plan, 32)
-    _, g = motion.value(motion.pack(plan.motion.path[0], plan.motion.rate[0]))
+    _, g = regularized_values(
+        motion, motion.pack(plan.motion.path[0], plan.motion.rate[0])
+    )
     states = plan.motion.at(motion.grid.s)
     np.testing.assert_allclose(
         g[:, 6:12], states.dq[0] / plan.robot.velocity_limit, atol=1e-12
@@ -173,7 +176,7 @@ def test_the_objective_is_an_integral_over_time_as_pinocchio_evaluates_it(
         for term in (cost_term_of(kind, 1.0), None)
     )
     x = without.pack(plan.motion.path[0], plan.motion.rate[0])
-    added = with_term.value(x)[0] - without.value(x)[0]
+    added = regularized_values(with_term, x)[0] - regularized_values(without, x)[0]
     exact = Motion(
         without.unpack(x)[0][None], plan.motion.rate
     )  # with its boundary control points recomputed
@@ -471,7 +474,7 @@ def test_the_iteration_never_ends_worse_than_it_began() -> None:
     plan = load("replan")
     motion = transcription(plan, 48)
     x = motion.pack(plan.motion.path[0], plan.motion.rate[0])
-    cost, g = motion.value(x)
+    cost, g = regularized_values(motion, x)
     bounds = Bounds(
         np.full(g.shape, -1.0),
         np.full(g.shape, 1.0),
@@ -529,13 +532,17 @@ def test_cached_values_of_a_transcription_belong_to_its_variables() -> None:
     motion = transcription(plan, 32, cost_term=cost_term)
     x = motion.pack(plan.motion.path[0], plan.motion.rate[0])
     for variables in (x, x + 0.01, x.copy(), x):
-        value, at = motion.value(variables), motion.evaluate(variables)
+        value, at = regularized_values(motion, variables), evaluate(motion, variables)
         fresh = transcription(plan, 32, cost_term=cost_term)
-        assert value[0] == pytest.approx(fresh.value(variables.copy())[0], rel=1e-14)
-        np.testing.assert_array_equal(
-            at.gradient, fresh.evaluate(variables.copy()).gradient
+        assert value[0] == pytest.approx(
+            regularized_values(fresh, variables.copy())[0], rel=1e-14
         )
-        np.testing.assert_array_equal(value[1], fresh.value(variables.copy())[1])
+        np.testing.assert_array_equal(
+            at.gradient, evaluate(fresh, variables.copy()).gradient
+        )
+        np.testing.assert_array_equal(
+            value[1], regularized_values(fresh, variables.copy())[1]
+        )
 
 
 def test_a_feasible_coarse_level_is_yielded_at_once_and_measured_only_if_rejected() -> (
@@ -617,7 +624,7 @@ def test_the_solution_of_a_subproblem_meets_the_optimality_conditions(
     plan, tool = load("hit"), refiner("airhockey")
     motion = tool.transcription(task(plan), tool.levels.coarse)
     bounds = tool.bounds(task(plan), tool.levels.coarse, motion.end_residuals())
-    at, backend = motion.evaluate(tool.line_guess(task(plan))), kind(motion, bounds)
+    at, backend = evaluate(motion, tool.line_guess(task(plan))), kind(motion, bounds)
     selection = ResidualSelection(
         bounds.max_violation(at.g),
         max_distance=0.4,
@@ -635,7 +642,7 @@ def test_the_solution_of_a_subproblem_meets_the_optimality_conditions(
     k, residual = np.nonzero(selected)
     g, multipliers = at.g[k, residual], step.multipliers[k, residual]
     rows, lower, upper = (
-        motion.rows(at, k, residual),
+        residual_gradients(motion, at, k, residual),
         bounds.lower[k, residual],
         bounds.upper[k, residual],
     )

@@ -153,7 +153,7 @@ def test_a_temporary_load_does_not_shorten_a_run(monkeypatch):
             settings=TrainingSettings(),
             architecture=Architecture(**dict.fromkeys(SIZES, 2)),
         ),
-        names=("time", "table"),
+        loss=SimpleNamespace(terms=("time", "table")),
         metric=Metric([1.0], [0.0]),
         initial_parameters=None,
         step=step,

@@ -29,7 +29,7 @@ from cnpgen.problems.load_robot import load_robot
 from cnpgen.problems.obstacles import with_capacity
 from cnpgen.problems.problem_file import load_problem
 from cnpgen.problems.problem_record import record_problem
-from cnpgen.robots.observation.primitives import primitives_of, signed_distances
+from cnpgen.robots.observation.primitives import primitives_of
 from cnpgen.robots.obstacle import Obstacle
 from cnpgen.robots.scene import Scene
 from cnpgen.robots.shape.hull import hull_corners
@@ -46,6 +46,7 @@ from cnpgen.training.training_options import TrainingOptions
 from cnpgen.trajectory.spline import clamped_knots
 from cnpgen.world.forward_kinematics import ForwardKinematics
 from tests.conftest import needs_compiler
+from tests.examples.numpy_observations import signed_distances
 from tests.examples.shaped_robot import WEDGE, write_problem
 
 TINY = TrainingSettings(hidden=8, layers=1, batch_size=16, nodes=8, validations=1)
@@ -244,7 +245,7 @@ def test_the_gradient_is_the_sum_of_those_of_all_iterations(problem):
     parameters = initial_parameters(
         learner.architecture, seed=1, head_scale=1.0, rate_bias=-0.5
     )
-    weights, clipping = np.ones(len(run.names) - 1), Clipping()
+    weights, clipping = np.ones(len(run.loss.terms) - 1), Clipping()
 
     def gradient(learner, rows):
         out = np.empty_like(parameters)

@@ -7,7 +7,6 @@ which this curve lacks at its samples counts as violated.
 
 from dataclasses import replace
 from functools import lru_cache
-from typing import Any
 
 import numpy as np
 
@@ -23,7 +22,7 @@ from cnpgen.addons.trajectories.interpolate import interpolated
 from cnpgen.addons.trajectories.judge_family import FamilyJudge
 from cnpgen.addons.trajectories.sampled_trajectory import Trajectory
 from cnpgen.addons.trajectories.trajectory_verdict import ConditionDecision, Decision
-from cnpgen.arrays import Array
+from cnpgen.arrays import Array, JsonObject
 from cnpgen.errors import UsageError
 from cnpgen.judges.plans.evaluated_trajectory import EvaluatedTrajectory
 from cnpgen.judges.plans.judge import reason_of
@@ -36,7 +35,7 @@ from cnpgen.plans.plans import Plans
 from cnpgen.problems.problem_record import ProblemRecord, open_problem
 from cnpgen.world.path import PathWorld
 
-Task = tuple[Plans, dict[str, Any], ExecutedPrefix | None]
+Task = tuple[Plans, JsonObject, ExecutedPrefix | None]
 """One boundary problem, the stored answer, and the executed prefix of a replanning scenario."""
 
 JUDGING_STEP_S = 1e-3

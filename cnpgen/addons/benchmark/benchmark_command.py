@@ -17,6 +17,7 @@ from dataclasses import asdict, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from cnpgen.arrays import JsonObject
 from cnpgen.cli import recipe_names, values
 from cnpgen.cli.interruption import resumable
 from cnpgen.cli.parser import (
@@ -29,7 +30,7 @@ from cnpgen.cli.parser import (
     refuse_others,
 )
 from cnpgen.cli.terminal import Meter, table
-from cnpgen.errors import CnpgenError, UsageError
+from cnpgen.errors import CnpgenError, UsageError, counted
 
 if TYPE_CHECKING:
     from cnpgen.addons.benchmark.run_suite import Benchmark
@@ -39,8 +40,13 @@ REPORT = "report.html"
 
 def add_options(parser: Parser) -> None:
     option = parser.add_argument
-    text = "a suite (see --list), or a dataset for random problems"
-    option("suite", metavar="SUITE", nargs="?", type=recipe_names.suite, help=text)
+    option(
+        "suite",
+        metavar="SUITE",
+        nargs="?",
+        type=recipe_names.suite,
+        help="a suite (see --list), or a dataset for random problems",
+    )
     option(
         "--list",
         action="store_true",
@@ -81,8 +87,12 @@ def _add_execution(parser: Parser) -> None:
         nargs="+",
         help="simulated robots that execute them (default: nominal)",
     )
-    text = "also execute them in this clone of the Air Hockey Challenge"
-    option("--environment", metavar="PATH", type=Path, help=text)
+    option(
+        "--environment",
+        metavar="PATH",
+        type=Path,
+        help="also execute them in this clone of the Air Hockey Challenge",
+    )
     option(
         "--video",
         action="store_true",
@@ -123,34 +133,37 @@ def _add_planning(parser: Parser) -> None:
 def _add_comparison(parser: Parser) -> None:
     """Add the options of the comparison, of the planners' fields and of earlier results."""
     option = parser.add_argument
-    text = "largest distance of the mallet of a successful hit from the table plane (default: 20mm)"
     option(
-        "--plane-tolerance", metavar="M", type=values.meters, default=0.02, help=text
+        "--plane-tolerance",
+        metavar="M",
+        type=values.meters,
+        default=0.02,
+        help="largest distance of the mallet of a successful hit from the table plane (default: 20mm)",
     )
     option(
         "--reference",
         metavar="NAME",
         help="planner that p-values compare with (default: cnpgen+refine)",
     )
-    text = "field of a planner, such as trajopt.iterations=50 or rrtconnect.simplify_time=0.5s"
     option(
         "--set",
         metavar="NAME.KEY=VALUE",
         nargs="+",
         default=[],
         type=parameter,
-        help=text,
+        help="field of a planner, such as trajopt.iterations=50 or rrtconnect.simplify_time=0.5s",
     )
     option(
         "--replan",
         action="store_true",
         help="discard earlier answers of these planners in DIR",
     )
-    text = (
-        "delete results of another suite, version, time limit, seed or planner parameters"
-        " in DIR, and replace files that are no results"
+    option(
+        "--force",
+        action="store_true",
+        help="delete results of another suite, version, time limit, seed or planner parameters"
+        " in DIR, and replace files that are no results",
     )
-    option("--force", action="store_true", help=text)
 
 
 def parameter(text: str) -> tuple[str, str, Any]:
@@ -247,7 +260,7 @@ def _run(arguments: argparse.Namespace, folder: Path) -> "Benchmark":
         )
 
 
-def _facts(found: "Benchmark", folder: Path) -> dict[str, Any]:
+def _facts(found: "Benchmark", folder: Path) -> JsonObject:
     """Return the results of all planners for JSON."""
     from cnpgen.addons.benchmark.hypothesis_tests import reference_planner
     from cnpgen.addons.benchmark.results_file import RESULTS_FORMAT, RESULTS_VERSION
@@ -276,7 +289,7 @@ def _text(found: "Benchmark") -> str:
         table_rows,
     )
 
-    head = f"{found.suite.name} {found.suite.version}: {len(found.problems)} problems"
+    head = f"{found.suite.name} {found.suite.version}: {counted(len(found.problems), 'problem')}"
     tables = [
         table([(*row, "") for row in table_rows(found, plant)], indent="  ")
         for plant in found.executions

@@ -4,9 +4,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from cnpgen.addons.benchmark.simulator.executed import PLANE_TOLERANCE_M
-from cnpgen.errors import UsageError
 from cnpgen.schema.argument_types import check_fields
-from cnpgen.schema.arguments import integer, number
+from cnpgen.schema.arguments import integer, not_negative, positive
 
 MAX_REPETITIONS = 10_000
 
@@ -48,14 +47,7 @@ class BenchmarkOptions:
 
     def __post_init__(self) -> None:
         check_fields(self)
-        if number("time_limit", self.time_limit) <= 0:
-            raise UsageError(
-                f"must be above 0 s, got {self.time_limit:g} s", argument="time_limit"
-            )
-        if number("plane_tolerance", self.plane_tolerance) < 0:
-            raise UsageError(
-                f"must not be negative, got {self.plane_tolerance:g} m",
-                argument="plane_tolerance",
-            )
+        positive("time_limit", self.time_limit, "s")
+        not_negative("plane_tolerance", self.plane_tolerance)
         integer("seed", self.seed, least=0)
         integer("repeat", self.repeat, least=1, most=MAX_REPETITIONS)

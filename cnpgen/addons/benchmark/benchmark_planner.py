@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Any
 
 import numpy as np
 
 from cnpgen.addons.trajectories.sampled_trajectory import Trajectory
-from cnpgen.arrays import Array
+from cnpgen.arrays import Array, JsonMapping
 from cnpgen.errors import UsageError
 from cnpgen.plans.plans import Plans
 from cnpgen.problems.problem import Problem
@@ -50,7 +49,7 @@ class Setting:
     time_limit: float = 60.0
     seed: int = 0
     repetition: int = 0
-    parameters: Mapping[str, Any] = field(default_factory=dict)
+    parameters: JsonMapping = field(default_factory=dict)
 
     @checked_arguments
     def random(self, problem: Plans) -> np.random.Generator:
@@ -110,7 +109,7 @@ def load_kind(name: str) -> type[BenchmarkPlanner]:
     return registry.load(PLANNERS, name, BenchmarkPlanner)
 
 
-def load_planner(name: str, parameters: Mapping[str, Any]) -> BenchmarkPlanner:
+def load_planner(name: str, parameters: JsonMapping) -> BenchmarkPlanner:
     """Load a planner by its name, with values of its fields as in a recipe.
 
     Raises:

@@ -18,8 +18,8 @@ from cnpgen.addons.benchmark.result_tables import failure_summaries, notes, tabl
 from cnpgen.addons.benchmark.run_suite import Benchmark
 from cnpgen.addons.benchmark.simulator.plant import Plant
 from cnpgen.addons.benchmark.simulator.rendering import save_film, save_picture
-from cnpgen.arrays import Array
-from cnpgen.errors import CnpgenError, MachineError
+from cnpgen.arrays import Array, JsonObject
+from cnpgen.errors import CnpgenError, MachineError, counted
 from cnpgen.schema.argument_types import checked_arguments
 from cnpgen.store.files.atomic import write_file
 from cnpgen.store.files.figure_file import new_figure, save_figure
@@ -170,8 +170,9 @@ def save_benchmark_report(
     """
     suite = benchmark.suite
     place = Path(path)
+    size = counted(len(benchmark.problems), "problem")
     parts = [
-        f"<h1>{escape(suite.name)} {suite.version}</h1><p>{escape(suite.title)}: {len(benchmark.problems)} problems</p>"
+        f"<h1>{escape(suite.name)} {suite.version}</h1><p>{escape(suite.title)}: {size}</p>"
     ]
     parts += [
         f"<p>{escape(text)}</p>"
@@ -243,7 +244,7 @@ def _motions(benchmark: Benchmark, *, video: bool) -> list[str]:
     return parts
 
 
-def _was_executed(row: dict[str, Any], plant: str) -> bool:
+def _was_executed(row: JsonObject, plant: str) -> bool:
     executed = row.get("executed", {}).get(plant)
     return executed is not None and "failure" not in executed
 

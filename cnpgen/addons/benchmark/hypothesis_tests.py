@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from cnpgen.addons.benchmark.simulator.executed import PLANE_TOLERANCE_M, succeeded
-from cnpgen.arrays import Array
+from cnpgen.arrays import Array, JsonMapping, JsonObject
 
 FLAGS = {  # of a row; those from "at the goal, executed" on need an execution
     "planned": "a plan was found",
@@ -62,7 +62,7 @@ Values = dict[str, bool | float]
 
 
 def values_of(
-    row: Mapping[str, Any], plant: str = "", plane_tolerance: float = PLANE_TOLERANCE_M
+    row: JsonMapping, plant: str = "", plane_tolerance: float = PLANE_TOLERANCE_M
 ) -> Values:
     """Return the known flags and figures of a row; empty if the planner or the plant does not apply.
 
@@ -94,7 +94,7 @@ def values_of(
     return {**values, **_values_of_verdict(row.get("verdict"))}
 
 
-def _values_of_verdict(verdict: Mapping[str, Any] | None) -> Values:
+def _values_of_verdict(verdict: JsonMapping | None) -> Values:
     """Return the flags and figures of a plan; without a plan, it is not valid."""
     if verdict is None:
         return {"valid": False, "paper_valid": False, "paper_finished": False}
@@ -114,12 +114,12 @@ def _values_of_verdict(verdict: Mapping[str, Any] | None) -> Values:
 
 
 def summarize_results(
-    results: Mapping[str, Sequence[Mapping[str, Any]]],
+    results: Mapping[str, Sequence[JsonMapping]],
     plant: str = "",
     *,
     reference: str | None = None,
     plane_tolerance: float = PLANE_TOLERANCE_M,
-) -> dict[str, dict[str, dict[str, dict[str, Any]]]]:
+) -> dict[str, dict[str, dict[str, JsonObject]]]:
     """Summarize the rows of all planners on a plant, or of their plans only if it is empty.
 
     Returns:
@@ -170,7 +170,7 @@ Keyed = Mapping[tuple[int, int], Values]
 """(problem, repetition) -> values."""
 
 
-def _ratio(key: str, rows: Keyed, others: Keyed) -> dict[str, Any]:
+def _ratio(key: str, rows: Keyed, others: Keyed) -> JsonObject:
     count = sum(bool(known.get(key, False)) for known in rows.values())
     of = len(rows)
     mine, theirs = (
@@ -193,7 +193,7 @@ def _ratio(key: str, rows: Keyed, others: Keyed) -> dict[str, Any]:
     }
 
 
-def _figure(key: str, rows: Keyed, others: Keyed) -> dict[str, Any]:
+def _figure(key: str, rows: Keyed, others: Keyed) -> JsonObject:
     values = np.array([known[key] for known in rows.values() if key in known], float)
     q1, median, q3 = np.quantile(values, [0.25, 0.5, 0.75]).tolist()
     tails = np.quantile(values, list(TAILS.values()), method="higher").tolist()
@@ -225,7 +225,7 @@ def _pairs(mine: Mapping[int, float], theirs: Mapping[int, float]) -> Array:
     ).reshape(-1, 2)
 
 
-def _correct(summary: dict[str, dict[str, dict[str, dict[str, Any]]]]) -> None:
+def _correct(summary: dict[str, dict[str, dict[str, JsonObject]]]) -> None:
     """Add the corrected p-values of a table."""
     statistics = [
         item

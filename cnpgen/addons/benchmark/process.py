@@ -16,6 +16,7 @@ from typing import Any
 from cnpgen.addons.benchmark.benchmark_planner import Plan, Setting, load_planner
 from cnpgen.addons.benchmark.results_file import answer_from_dict, answer_to_dict
 from cnpgen.addons.trajectories.sampled_trajectory import Trajectory
+from cnpgen.arrays import JsonObject
 from cnpgen.errors import CnpgenError, MachineError, UsageError
 from cnpgen.machine.threads import one_thread
 from cnpgen.plans.plans import Plans
@@ -46,7 +47,7 @@ class PlanningOutcome:
     """
 
     ending: Ending
-    answer: dict[str, Any] | None = None
+    answer: JsonObject | None = None
     seconds: float = 0.0
     cpu_seconds: float = 0.0
     error: str = ""
@@ -230,7 +231,7 @@ def _plan_once(plan: Plan, problem: Plans) -> PlanningOutcome:
     )
 
 
-def _content(answer: Any, problem: Plans) -> dict[str, Any] | None:
+def _content(answer: Any, problem: Plans) -> JsonObject | None:
     """Return the stored form of an answer after checking that it can be read."""
     if answer is None:
         return None

@@ -6,13 +6,12 @@ its moving state.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 
-from cnpgen.arrays import Array
+from cnpgen.arrays import Array, NamedErrors
 from cnpgen.errors import RecipeError
 from cnpgen.make.complete import complete
 from cnpgen.pipelines.pipeline import Pipeline
@@ -54,7 +53,7 @@ class Pucks:
         plausible=1.0,
     )
 
-    def validate(self) -> Iterator[tuple[str, str]]:
+    def validate(self) -> NamedErrors:
         """Yield (key, error) pairs."""
         if (count := self.columns * self.rows) > MAX_TASKS:
             yield (
@@ -128,7 +127,7 @@ class ReplanningScenario:
     )
     pucks: Pucks = field("grid of pucks of the first and of the second motion")
 
-    def validate(self) -> Iterator[tuple[str, str]]:
+    def validate(self) -> NamedErrors:
         """Yield (key, error) pairs."""
         if self.pucks.columns * self.pucks.rows % 2:
             yield (

@@ -3,7 +3,7 @@
 import csv
 import io
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +16,8 @@ from cnpgen.addons.benchmark.hypothesis_tests import (
     values_of,
 )
 from cnpgen.addons.benchmark.run_suite import Benchmark
+from cnpgen.arrays import JsonMapping, JsonObject, TextRows
+from cnpgen.errors import counted
 from cnpgen.schema.argument_types import checked_arguments
 from cnpgen.store.files.atomic import write_file
 
@@ -85,11 +87,11 @@ def save_benchmark_tables(benchmark: Benchmark, folder: str | Path) -> tuple[Pat
     return paths
 
 
-def table_rows(benchmark: Benchmark, plant: str) -> list[tuple[str, ...]]:
+def table_rows(benchmark: Benchmark, plant: str) -> TextRows:
     """Return the comparison on a plant: a head, then one row per ratio and figure, with the paper's values."""
     summary = benchmark.summary(plant)
     printed = PRINTED.get(benchmark.suite.name, {})
-    rows: list[tuple[str, ...]] = [(f"{plant} plant" if plant else "planned", *summary)]
+    rows: TextRows = [(f"{plant} plant" if plant else "planned", *summary)]
     missing = {
         name: _missing_text(benchmark.results[name])
         for name in summary
@@ -128,7 +130,7 @@ def _constraints(benchmark: Benchmark) -> set[str]:
     return {constraint["use"] for constraint in content["constraint"]}
 
 
-def _missing_text(rows: Sequence[Mapping[str, Any]]) -> str:
+def _missing_text(rows: Sequence[JsonMapping]) -> str:
     """Return the reason why a planner has no values: it does not apply, or the plant has not executed its plans."""
     return (
         NOT_APPLICABLE
@@ -137,7 +139,7 @@ def _missing_text(rows: Sequence[Mapping[str, Any]]) -> str:
     )
 
 
-def cell_text(statistic: dict[str, Any] | None, printed: str | None = None) -> str:
+def cell_text(statistic: JsonObject | None, printed: str | None = None) -> str:
     """Format a ratio with its interval, or a figure with its quartiles, and the paper's value."""
     if statistic is None:
         return f"paper: {printed}" if printed else ""
@@ -154,7 +156,7 @@ def cell_text(statistic: dict[str, Any] | None, printed: str | None = None) -> s
     return text + (f" (paper: {printed})" if printed else "")
 
 
-def tail_text(statistic: dict[str, Any] | None) -> str:
+def tail_text(statistic: JsonObject | None) -> str:
     """Format the tails of a figure."""
     return (
         ""
@@ -309,7 +311,8 @@ def latex_text(benchmark: Benchmark) -> str:
             for row in zip(*table_rows(benchmark, plant), strict=True)
         ]
         (_, *head), *planners = rows
-        caption = f"{suite.title or suite.name}: {len(benchmark.problems)} problems of {suite.name} {suite.version}"
+        size = counted(len(benchmark.problems), "problem")
+        caption = f"{suite.title or suite.name}: {size} of {suite.name} {suite.version}"
         caption += f", executed by the {plant} plant." if plant else "."
         label = f"tab:{suite.name}{f'-{plant}' if plant else ''}"
         lines += [

@@ -16,6 +16,7 @@ from cnpgen.addons.benchmark.benchmark_planner import PLANNERS, Setting
 from cnpgen.addons.benchmark.hypothesis_tests import FIGURES
 from cnpgen.addons.benchmark.suite import Suite
 from cnpgen.addons.trajectories.sampled_trajectory import Trajectory
+from cnpgen.arrays import JsonObject
 from cnpgen.errors import DatasetError, UsageError
 from cnpgen.machine.versions import __version__, installed_version
 from cnpgen.plans.plans import Plans, make_plans
@@ -66,9 +67,9 @@ class Results:
     """Results of one planner: the file, and problem -> its row, see ``cnpgen docs benchmark``."""
 
     path: Path
-    rows: dict[int, dict[str, Any]] = field(default_factory=dict)
+    rows: dict[int, JsonObject] = field(default_factory=dict)
 
-    def append(self, row: dict[str, Any]) -> None:
+    def append(self, row: JsonObject) -> None:
         """Append a line to the file and to the rows."""
         text = json.dumps(row, allow_nan=False)
         # Equal to the row that a later run reads.
@@ -88,7 +89,7 @@ class Results:
             if row.get("answer") is not None and plant not in row.get("executed", {}):
                 yield index
 
-    def _merge(self, row: dict[str, Any]) -> None:
+    def _merge(self, row: JsonObject) -> None:
         known = self.rows.setdefault(row["problem"], {})
         # Executions of several plants add up; other keys of a row are replaced.
         executed = {**known.get("executed", {}), **row.get("executed", {})}
@@ -99,7 +100,7 @@ class Results:
 
 def open_results(
     path: Path,
-    identity: dict[str, Any],
+    identity: JsonObject,
     *,
     overwrite: bool = False,
     discard: bool = False,
@@ -187,7 +188,7 @@ def _check_row(row: Any) -> None:
 
 
 def _present(
-    structures: dict[str, Structure], table: dict[str, Any]
+    structures: dict[str, Structure], table: JsonObject
 ) -> dict[str, Structure]:
     return {name: structure for name, structure in structures.items() if name in table}
 
@@ -206,7 +207,7 @@ def _complete_lines(path: Path) -> list[str]:
     return complete
 
 
-def answer_to_dict(answer: Plans | Trajectory) -> dict[str, Any]:
+def answer_to_dict(answer: Plans | Trajectory) -> JsonObject:
     """Write an answer for JSON; numbers read back as the same float64."""
     if isinstance(answer, Plans):
         return {
@@ -221,7 +222,7 @@ def answer_to_dict(answer: Plans | Trajectory) -> dict[str, Any]:
     }
 
 
-def answer_from_dict(problem: Plans, content: dict[str, Any]) -> Plans | Trajectory:
+def answer_from_dict(problem: Plans, content: JsonObject) -> Plans | Trajectory:
     """Read an answer for one boundary problem.
 
     Raise UsageError if a shape or the number of joints is wrong.
@@ -288,7 +289,7 @@ class ResultsFolder:
             "seed": setting.seed,
         }
 
-    def _results(self) -> Iterator[tuple[Path, dict[str, Any], Results | None]]:
+    def _results(self) -> Iterator[tuple[Path, JsonObject, Results | None]]:
         """Yield path, head and results of every file.
 
         None for results of another suite, version or time limit.
@@ -327,7 +328,7 @@ class ResultsFolder:
         self,
         planner: str,
         repetition: int,
-        parameters: dict[str, Any],
+        parameters: JsonObject,
         *,
         overwrite: bool,
         discard: bool,
@@ -357,7 +358,7 @@ class ResultsFolder:
             self.path / name, identity, overwrite=overwrite, discard=discard
         )
 
-    def rows(self, first: Sequence[str]) -> dict[str, list[dict[str, Any]]]:
+    def rows(self, first: Sequence[str]) -> dict[str, list[JsonObject]]:
         """Return planner -> rows of all results, the given planners first."""
         parts: dict[str, dict[int, Results]] = {name: {} for name in first}
         for _, head, results in self._results():

@@ -7,8 +7,8 @@ from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any
 
+from cnpgen.arrays import JsonObject
 from cnpgen.errors import DatasetError
 from cnpgen.machine.versions import installed_version, processor_entry, versions
 from cnpgen.store.files.atomic import read_file, write_file
@@ -104,7 +104,7 @@ def load_runs(folder: Path) -> tuple[RunRecord, ...]:
 def add_run(folder: Path, seed: int, planners: Sequence[str]) -> tuple[RunRecord, ...]:
     """Record a run that begins now, and return the records of all runs; errors as of ``load_runs``."""
     runs = (*load_runs(folder), describe_run(seed, planners))
-    documents: list[dict[str, Any]] = [asdict(run) for run in runs]
+    documents: list[JsonObject] = [asdict(run) for run in runs]
     write_file(folder / RUNS_FILE, json.dumps(documents, indent=1) + "\n")
     return runs
 

@@ -30,7 +30,8 @@ from cnpgen.addons.benchmark.simulator.execute import load_mujoco
 from cnpgen.addons.benchmark.simulator.executed import PLANE_TOLERANCE_M
 from cnpgen.addons.benchmark.simulator.plant import Plant, as_plant
 from cnpgen.addons.benchmark.suite import PlannerFields, Suite, load_suite
-from cnpgen.errors import RecipeError, UsageError
+from cnpgen.arrays import JsonMapping, JsonObject
+from cnpgen.errors import RecipeError, UsageError, counted
 from cnpgen.judges.plans.verdict import Verdict
 from cnpgen.machine.engine import Engine, WorkerPool, assembled
 from cnpgen.plans.plans import Plans
@@ -50,7 +51,7 @@ Progress = Callable[[str, int, int], None]
 Numbered = tuple[int, Plans]
 """The number of a problem and the problem."""
 
-Rows = Generator[dict[str, Any], None, None]
+Rows = Generator[JsonObject, None, None]
 """Rows of results, yielded as they are finished."""
 
 
@@ -76,14 +77,14 @@ class Benchmark:
     suite: Suite
     problems: Plans
     prefix: ExecutedPrefix | None
-    results: dict[str, list[dict[str, Any]]]
+    results: dict[str, list[JsonObject]]
     plants: tuple[Plant, ...] = ()
     runs: tuple[RunRecord, ...] = ()
     reference: str | None = None
     plane_tolerance: float = PLANE_TOLERANCE_M
 
     def __repr__(self) -> str:
-        return f"<{self.suite.name}: {len(self.problems)} problems, {', '.join(self.results)}>"
+        return f"<{self.suite.name}: {counted(len(self.problems), 'problem')}, {', '.join(self.results)}>"
 
     @property
     def executions(self) -> tuple[str, ...]:
@@ -101,9 +102,7 @@ class Benchmark:
         return tuple(known) or ("",)
 
     @checked_arguments
-    def summary(
-        self, plant: str = ""
-    ) -> dict[str, dict[str, dict[str, dict[str, Any]]]]:
+    def summary(self, plant: str = "") -> dict[str, dict[str, dict[str, JsonObject]]]:
         """Return ratios, medians, quartiles and p-values of every planner; see ``summarize_results``.
 
         Args:
@@ -125,7 +124,7 @@ def run_benchmark(
     planners: Sequence[str] = FASTEST,
     n: int | None = None,
     plants: Sequence[str | Plant] = (),
-    parameters: Mapping[str, Mapping[str, Any]] | None = None,
+    parameters: Mapping[str, JsonMapping] | None = None,
     workers: int | None = None,
     force: bool = False,
     progress: Progress | None = None,
@@ -176,9 +175,8 @@ def run_benchmark(
     problems, prefix = loaded.problems(n)
     if chosen.environment is not None:
         check_challenge(*open_problem(problems.problem))
-    limit = float(chosen.time_limit)
-    seed = int(chosen.seed)
-    setting = Setting(problems.problem, loaded.model, limit, seed)
+    seed = chosen.seed
+    setting = Setting(problems.problem, loaded.model, chosen.time_limit, seed)
     place = ResultsFolder(Path(folder), loaded, setting)
     names = {*place.planners(delete_others=force), *planners}
     _check_reference(chosen.reference, names)
@@ -216,7 +214,7 @@ def _checked_plants(
 def _checked_planners(
     planners: Sequence[str],
     of_suite: PlannerFields,
-    parameters: Mapping[str, Mapping[str, Any]],
+    parameters: Mapping[str, JsonMapping],
 ) -> PlannerFields:
     """Return planner -> given values of its fields, after checking names before any work."""
     known = registry.names(PLANNERS)
@@ -245,7 +243,7 @@ def _checked_planners(
     }
 
 
-def _checked_parameters(planner: str, parameters: Mapping[str, Any]) -> dict[str, Any]:
+def _checked_parameters(planner: str, parameters: JsonMapping) -> JsonObject:
     """Return the values of all fields of a planner."""
     try:
         # A dataclass, as its contract requires.
@@ -269,7 +267,7 @@ class _BenchmarkRun:
     overwrite: bool
     progress: Progress | None
 
-    def compare(self, name: str, setting: Setting, values: dict[str, Any]) -> None:
+    def compare(self, name: str, setting: Setting, values: JsonObject) -> None:
         """Plan for all problems and execute the plans, once per repetition; ``values`` are those of all fields."""
         for repetition in range(self.options.repeat):
             results = self.place.open(
@@ -372,15 +370,13 @@ def _plan_in_pool(
             yield from ({**row, "planners_at_once": pool.size} for row in rows)
 
 
-def _plan_task(
-    name: str, setting: Setting, part: list[Numbered]
-) -> list[dict[str, Any]]:
+def _plan_task(name: str, setting: Setting, part: list[Numbered]) -> list[JsonObject]:
     return list(_plan_locally(name, setting, part))
 
 
-def _row(index: int, problem: Plans, outcome: PlanningOutcome) -> dict[str, Any]:
+def _row(index: int, problem: Plans, outcome: PlanningOutcome) -> JsonObject:
     """Return the row of a problem."""
-    row: dict[str, Any] = {
+    row: JsonObject = {
         "problem": index,
         "ending": str(outcome.ending),
         "planning_s": outcome.seconds,
@@ -396,7 +392,7 @@ def _row(index: int, problem: Plans, outcome: PlanningOutcome) -> dict[str, Any]
     return row
 
 
-def verdict_to_dict(verdict: Verdict) -> dict[str, Any]:
+def verdict_to_dict(verdict: Verdict) -> JsonObject:
     """Return the stored part of a verdict: reason, paper's rule, metrics, and the severity of every condition."""
     severity = {name: margin.severity for name, margin in verdict.margins.items()}
     return {

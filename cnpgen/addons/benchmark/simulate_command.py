@@ -85,8 +85,12 @@ def _add_outputs(parser: Parser) -> None:
         default=0,
         help="plan to draw (default: 0)",
     )
-    text = "draw the world at the end of one plan: .png"
-    option("--image", metavar="PICTURE", type=values.file_in(".png"), help=text)
+    option(
+        "--image",
+        metavar="PICTURE",
+        type=values.file_in(".png"),
+        help="draw the world at the end of one plan: .png",
+    )
     option(
         "--video",
         metavar="FILM",
@@ -104,7 +108,7 @@ def run(arguments: argparse.Namespace) -> int:
     plans = recipe_names.read_plans(arguments.file, problem=arguments.problem)
     if arguments.plan >= len(plans):
         raise UsageError(
-            f"{arguments.file} has no plan {arguments.plan}: {len(plans)} plans are numbered from 0"
+            f"{arguments.file} has no plan {arguments.plan}: {counted(len(plans), 'plan')}, numbered from 0"
         )
     with Meter(quiet=arguments.quiet or not sys.stderr.isatty(), noun="plan") as meter:
         meter.begin(f"executing {arguments.file}", len(plans))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -16,6 +15,7 @@ from cnpgen.addons.benchmark.pucks import (
     scenario_problems,
 )
 from cnpgen.addons.scene_files.scene_files import load_scenes
+from cnpgen.arrays import JsonObject, NamedErrors
 from cnpgen.errors import CnpgenError, nearest
 from cnpgen.make.draw_boundary_problems import draw_boundary_problems
 from cnpgen.make.recipe import load_dataset_recipe
@@ -35,7 +35,7 @@ from cnpgen.schema.units import show
 
 DEFAULT_SAMPLES = 100
 
-PlannerFields = dict[str, dict[str, Any]]
+PlannerFields = dict[str, JsonObject]
 """Planner -> its field -> value, as in a recipe."""
 
 
@@ -86,7 +86,7 @@ class Suite:
         since_version=2,
     )
 
-    def validate(self) -> Iterator[tuple[str, str]]:
+    def validate(self) -> NamedErrors:
         """Yield (key, error) pairs."""
         if (
             sum(

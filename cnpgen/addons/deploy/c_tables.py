@@ -41,13 +41,22 @@ def cells(parts: PlannerParts) -> Array:
 
 def sizes(parts: PlannerParts) -> dict[str, int]:
     """Return the whole-number constants of the C file by name."""
-    model, spec, problem = parts.model, parts.problem.trajectory, parts.problem
-    n, fixed, blocks = parts.robot.n, model.fixed_at_goal, model.features.blocks
+    return {
+        **_task_sizes(parts),
+        **_motion_sizes(parts),
+        **_grid_sizes(parts),
+        **_fit_sizes(parts),
+    }
+
+
+def _task_sizes(parts: PlannerParts) -> dict[str, int]:
+    """Return the sizes of a request, its scene and its features."""
+    model, problem, n = parts.model, parts.problem, parts.robot.n
+    blocks = model.features.blocks
     first = blocks.index("expected_time") if "expected_time" in blocks else -1
     # The C code replaces the time in the features by its logarithm, at this index.
     before = count_features(blocks[: max(first, 0)], n, len(problem.parameters))
-    orders, edges = problem.path_orders, cells(parts)
-    values = {
+    return {
         "JOINTS": n,
         "CONDITIONS": len(parts.conditions),
         "ENDS": n * len(parts.conditions),
@@ -57,20 +66,35 @@ def sizes(parts: PlannerParts) -> dict[str, int]:
         "FEATURES": model.architecture.inputs,
         "FEATURE_WIDTH": padded(model.architecture.inputs, INPUTS),
         "TIME_FEATURE": before if first >= 0 else -1,
+    }
+
+
+def _motion_sizes(parts: PlannerParts) -> dict[str, int]:
+    """Return the sizes of a motion and of its states in the column of a phase."""
+    problem, spec, n = parts.problem, parts.problem.trajectory, parts.robot.n
+    orders = problem.path_orders
+    return {
         "DEGREE": spec.degree,
         "PATH_POINTS": spec.path_control_points,
         "RATE_POINTS": spec.rate_control_points,
         "PATH_SPANS": spec.path_control_points - spec.degree,
         "RATE_SPANS": spec.rate_control_points - spec.degree,
-        "OFFSETS": n * (spec.path_control_points - 3 - fixed),
+        "OFFSETS": n * (spec.path_control_points - 3 - parts.model.fixed_at_goal),
         "LINE_STEPS": int("line_change" in parts.tapes),
         "ORDERS": orders,
         "JERK": int(orders > 3),
         # Derivatives of p, those of r, and the scene.
         "COLUMNS": n * orders + orders - 1 + problem.scene_width,
+    }
+
+
+def _grid_sizes(parts: PlannerParts) -> dict[str, int]:
+    """Return the sizes of the check, of quadrature and of loops."""
+    edges = cells(parts)
+    return {
         "PHASES": len(parts.phases),
         "CHECKED_PHASES": len(parts.checked_phases),
-        "CONSTRAINTS": len(problem.constraint),
+        "CONSTRAINTS": len(parts.problem.constraint),
         "POSITION_ROWS": len(parts.position_constraints),
         "MOVING_ROWS": len(parts.moving_constraints),
         "CELLS": len(edges) - 1,
@@ -82,13 +106,16 @@ def sizes(parts: PlannerParts) -> dict[str, int]:
         "INPUTS": INPUTS,
         "LANES": LANES,
     }
-    if parts.parametrization is not None:
-        order, _ = moves_of(spec.rate_control_points, parts.parametrization.fixed)
-        values |= {
-            "ROWS": len(parts.parametrization.lower),
-            "MOVES": len(order),
-            "FIXED_RATES": parts.parametrization.fixed,
-        }
+
+
+def _fit_sizes(parts: PlannerParts) -> dict[str, int]:
+    """Return the sizes of the time parametrization and of time scaling, where the planner has them."""
+    values = {}
+    if (fit := parts.parametrization) is not None:
+        points = parts.problem.trajectory.rate_control_points
+        values["ROWS"] = len(fit.lower)
+        values["MOVES"] = len(moves_of(points, fit.fixed)[0])
+        values["FIXED_RATES"] = fit.fixed
     if parts.scaling is not None:
         values["RESIDUALS"] = len(parts.scaling.lower)
     return values

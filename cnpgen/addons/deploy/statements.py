@@ -36,12 +36,8 @@ def statements(
     names: dict[int, str] = {}
     angles: set[int] = set()
     never_nan: set[int] = set()
-    columns = (
-        tape.operation.tolist(),
-        tape.a.tolist(),
-        tape.b.tolist(),
-        tape.constant.tolist(),
-    )
+    arrays = tape.operation, tape.a, tape.b, tape.constant
+    columns = (array.tolist() for array in arrays)
     for k, (code, a, b, constant) in enumerate(zip(*columns, strict=True)):
         name = NAMES[code]
         if name == "CONST":
@@ -62,17 +58,18 @@ def statements(
             expression = read(a, b)
             never_nan |= {k} if a in numbers else set()
         else:
-            templates = (
-                _WITHOUT_NAN
-                if name in _WITHOUT_NAN and b in never_nan
-                else _EXPRESSIONS
-            )
-            expression = templates[name].format(names[a], names[b])
+            expression = _expression(name, names[a], names[b], number=b in never_nan)
             # Minimum and maximum are nan only if both operands are.
             never_nan |= {k} if name in _WITHOUT_NAN and never_nan & {a, b} else set()
         names[k] = f"t{k}"
         lines.append(f"v t{k}={expression};")
     return "\n".join(lines)
+
+
+def _expression(name: str, a: str, b: str, *, number: bool) -> str:
+    """Return an operation of one operand or two; the second is never nan if it is a ``number``."""
+    templates = _WITHOUT_NAN if number and name in _WITHOUT_NAN else _EXPRESSIONS
+    return templates[name].format(a, b)
 
 
 def _literal(constant: float) -> str:

@@ -51,10 +51,8 @@ def task(
     parameters_sx, parameters = symbols("parameters", len(problem.parameters))
     split = [ends[i : i + robot.n] for i in range(0, len(ends), robot.n)]
     conditions = dict(zip(CONDITION_NAMES, split, strict=False))
-    start, goal = (
-        forward_kinematics(robot.chain, conditions[name])
-        for name in ("start_q", "goal_q")
-    )
+    start = forward_kinematics(robot.chain, conditions["start_q"])
+    goal = forward_kinematics(robot.chain, conditions["goal_q"])
     velocity = tip_velocity(goal, conditions["goal_dq"])
     poses = _scene(
         robot,

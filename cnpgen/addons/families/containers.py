@@ -4,9 +4,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import numpy as np
+from numpy.random import Generator
 
 from cnpgen.addons.families.furniture import Furniture, place_furniture
+from cnpgen.arrays import Vector3
 from cnpgen.pipelines.scene_family import Layout, SceneFamily, length, uniform, whole
 from cnpgen.schema.keys import Range, field
 
@@ -18,7 +19,7 @@ def _open_box(
     prefix: str,
     center: tuple[float, float],
     bottom: float,
-    size: tuple[float, float, float],
+    size: Vector3,
 ) -> None:
     """Add a bottom and four walls."""
     (x, y), (depth, width, height) = center, size
@@ -55,7 +56,7 @@ class OpenBox(SceneFamily):
         "number of cylinders in the box", default=Range(0, 2), low=0, high=10
     )
 
-    def draw(self, random: np.random.Generator) -> Layout:
+    def draw(self, random: Generator) -> Layout:
         """Draw the box, the cylinders and grasps inside of it."""
         box = place_furniture(random, self)
         width, depth, height = (
@@ -67,15 +68,13 @@ class OpenBox(SceneFamily):
         for index in range(whole(random, self.objects)):
             x = depth * random.uniform(0.25, 0.75)
             y = width * (index - 0.5) * random.uniform(0.3, 0.6)
-            box.cylinder(
-                f"object {index + 1}", (float(x), float(y), floor + 0.05), 0.03, 0.1
-            )
-            box.grasp((float(x), float(y), floor + 0.12), (0, 0, -1))
+            box.cylinder(f"object {index + 1}", (x, y, floor + 0.05), 0.03, 0.1)
+            box.grasp((x, y, floor + 0.12), (0, 0, -1))
         for _ in range(6):
             x = depth * random.uniform(0.3, 0.7)
             y = width * random.uniform(-0.25, 0.25)
             box.grasp(
-                (float(x), float(y), floor + float(random.uniform(0.06, 0.16))),
+                (x, y, floor + random.uniform(0.06, 0.16)),
                 (0.15, 0, -1),
             )
         return box.layout()
@@ -94,7 +93,7 @@ class Cage(SceneFamily):
         "height between the bars in front", Range(0.3, 0.42), low=0.15
     )
 
-    def draw(self, random: np.random.Generator) -> Layout:
+    def draw(self, random: Generator) -> Layout:
         """Draw walls, bars and an object in the cage."""
         cage = place_furniture(random, self, uniform(random, self.bottom))
         size = uniform(random, self.size)
@@ -109,8 +108,8 @@ class Cage(SceneFamily):
         cage.box("back", (size, 0, size / 2), (thin, size - thin, size - thin))
         cage.box("bar below", (0, 0, low), (bar, size - thin, bar))
         cage.box("bar above", (0, 0, low + opening), (bar, size - thin, bar))
-        x = float(random.uniform(0.15, 0.3))
-        y = float(random.uniform(-0.15, 0.15))
+        x = random.uniform(0.15, 0.3)
+        y = random.uniform(-0.15, 0.15)
         cage.box("cube", (x, y, thin / 2 + 0.035), (0.07, 0.07, 0.07))
         cage.grasp((x - 0.06, y, 0.15), (1, 0, -0.6), tilt=0.4)
         for _ in range(5):
@@ -135,7 +134,7 @@ class Dresser(SceneFamily):
     height: Range = length("height of a drawer", Range(0.12, 0.18), low=0.05)
     bottom: Range = length("height of the lower drawer's bottom", Range(0.05, 0.25))
 
-    def draw(self, random: np.random.Generator) -> Layout:
+    def draw(self, random: Generator) -> Layout:
         """Draw the body, the drawers side by side, and grasps in them."""
         dresser = place_furniture(random, self)
         width, height, bottom = (
@@ -144,12 +143,12 @@ class Dresser(SceneFamily):
         count = whole(random, self.drawers)
         lengths = [uniform(random, self.extension) for _ in range(count)]
         body = 0.3
-        total = float(random.uniform(0.6, 0.9))
+        total = random.uniform(0.6, 0.9)
         front = max(lengths)
         dresser.box("body", (front + body / 2, 0, total / 2), (body, 1.0, total))
         for index, extended in enumerate(lengths):
             y = 0.0 if count == 1 else (index - 0.5) * (width + 0.03)
-            z = bottom + (float(random.uniform(0.0, 0.25)) if index else 0.0)
+            z = bottom + (random.uniform(0.0, 0.25) if index else 0.0)
             x = front - extended / 2
             _open_box(
                 dresser, f"drawer {index + 1}", (x, y), z, (extended, width, height)
@@ -159,8 +158,6 @@ class Dresser(SceneFamily):
                     x + extended * random.uniform(-0.15, 0.15),
                     y + width * random.uniform(-0.2, 0.2),
                 )
-                level = z + WALL_M + float(random.uniform(0.05, height))
-                dresser.grasp(
-                    (float(place[0]), float(place[1]), level), (0.2, 0, -1), tilt=0.35
-                )
+                level = z + WALL_M + random.uniform(0.05, height)
+                dresser.grasp((*place, level), (0.2, 0, -1), tilt=0.35)
         return dresser.layout()

@@ -6,6 +6,7 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.random import Generator
 
 from cnpgen.pipelines.scene_family import (
     Grasp,
@@ -40,7 +41,7 @@ class FreeMix(SceneFamily):
     height: Range = length("heights of the centers", Range(0.05, 0.9))
     bearing: Range = angle("directions of the centers from the base", Range(-2.2, 2.2))
 
-    def draw(self, random: np.random.Generator) -> Layout:
+    def draw(self, random: Generator) -> Layout:
         """Draw the obstacles, and grasps between them in all directions."""
         obstacles = [
             self._obstacle(random, index) for index in range(whole(random, self.count))
@@ -48,7 +49,7 @@ class FreeMix(SceneFamily):
         grasps = []
         for _ in range(10):
             bearing = uniform(random, self.bearing)
-            radius = float(random.uniform(0.35, 0.65))
+            radius = random.uniform(0.35, 0.65)
             position = np.array(
                 [
                     radius * math.cos(bearing),
@@ -64,9 +65,9 @@ class FreeMix(SceneFamily):
             )
         return Layout(tuple(obstacles), tuple(grasps))
 
-    def _obstacle(self, random: np.random.Generator, index: int) -> Obstacle:
+    def _obstacle(self, random: Generator, index: int) -> Obstacle:
         a, b, c = (uniform(random, self.size) for _ in range(3))
-        share = float(random.random())
+        share = random.random()
         bearing = uniform(random, self.bearing)
         extent = math.hypot(a, b, c) / 2
         radius = max(uniform(random, self.radius), MIN_BASE_DISTANCE_M + extent)

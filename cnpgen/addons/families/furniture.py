@@ -6,6 +6,7 @@ import math
 from dataclasses import dataclass, field
 
 import numpy as np
+from numpy.random import Generator
 
 from cnpgen.pipelines.scene_family import Grasp, Layout, SceneFamily, uniform, whole
 from cnpgen.robots.obstacle import Obstacle
@@ -91,7 +92,7 @@ class Furniture:
 
 
 def place_furniture(
-    random: np.random.Generator, family: SceneFamily, z: float = 0.0
+    random: Generator, family: SceneFamily, z: float = 0.0
 ) -> Furniture:
     """Draw the frame of furniture: its origin is the center of the front at the height z [m]."""
     distance = uniform(random, family.distance)
@@ -110,7 +111,7 @@ And heights [m].
 
 
 def _free_place(
-    random: np.random.Generator, area: Area, radius: float, circles: list[Point]
+    random: Generator, area: Area, radius: float, circles: list[Point]
 ) -> tuple[float, float] | None:
     """Draw a position at which a circle is apart from the others (x, y, radius); None without one."""
     for _ in range(MAX_PLACEMENTS):
@@ -124,7 +125,7 @@ def _free_place(
 
 
 def place_objects(
-    random: np.random.Generator,
+    random: Generator,
     furniture: Furniture,
     area: Area,
     z: float,
@@ -141,7 +142,7 @@ def place_objects(
     count, widths, heights = objects
     for index in range(whole(random, count)):
         a, b, height = (uniform(random, size) for size in (widths, widths, heights))
-        is_box = bool(random.random() < 0.5)
+        is_box = random.random() < 0.5
         # The circle round the base, whatever the turn of a box.
         radius = math.hypot(a, b) / 2 if is_box else a / 2
         place = _free_place(random, area, radius, circles)
@@ -153,7 +154,7 @@ def place_objects(
         name = f"{prefix} {index + 1}"
         center = (x, y, z + height / 2)
         if is_box:
-            turn = float(random.uniform(-math.pi, math.pi))
+            turn = random.uniform(-math.pi, math.pi)
             furniture.box(name, center, (a, b, height), turn)
         else:
             furniture.cylinder(name, center, a / 2, height)

@@ -13,12 +13,16 @@ import argparse
 import json
 import sys
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
+from cnpgen.arrays import JsonObject
 from cnpgen.cli import recipe_names, values
 from cnpgen.cli.parser import Parser, add_json, refuse_others
 from cnpgen.cli.terminal import Meter
 from cnpgen.errors import RecipeError, UsageError, counted
+
+if TYPE_CHECKING:
+    from cnpgen.problems.scenes.scene_problem import SceneProblem
 
 
 def _family(text: str) -> str:
@@ -107,14 +111,19 @@ def run(arguments: argparse.Namespace) -> None:
             progress=meter,
         )
     save_scenes(out, scenes)
-    obstacles = [len(scene.obstacles) for scene in scenes]
     groups = len({id(scene.obstacles) for scene in scenes})
     facts = {"file": str(out), "problems": len(scenes), "scenes": groups}
     if not arguments.quiet:
-        text = f"{counted(len(scenes), 'problem')} in {counted(groups, 'scene')}"
-        text += f" with {min(obstacles)} to {max(obstacles)} obstacles"
-        print(text, file=sys.stderr)
+        print(_summary(scenes, groups), file=sys.stderr)
     print(json.dumps(facts, indent=2) if arguments.json else out)
+
+
+def _summary(scenes: "list[SceneProblem]", groups: int) -> str:
+    """Return the numbers of problems, of the groups with one scene, and of obstacles."""
+    obstacles = [len(scene.obstacles) for scene in scenes]
+    text = f"{counted(len(scenes), 'problem')} in {counted(groups, 'scene')}"
+    fewest = f"{min(obstacles)} to " if min(obstacles) < max(obstacles) else ""
+    return f"{text} with {fewest}{counted(max(obstacles), 'obstacle')}"
 
 
 def _check_place(out: Path, *, force: bool) -> None:
@@ -141,7 +150,7 @@ def _listing(*, as_json: bool) -> str:
     from cnpgen.schema import registry
     from cnpgen.schema.keys import keys
 
-    table: dict[str, Any] = {}
+    table: JsonObject = {}
     for name in registry.names(registry.FAMILIES):
         try:
             family = registry.load(registry.FAMILIES, name)

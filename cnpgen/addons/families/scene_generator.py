@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import zlib
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
+from numpy.random import Generator
 
-from cnpgen.arrays import Array
+from cnpgen.arrays import Array, JsonMapping
 from cnpgen.errors import RecipeError, UsageError, nearest
 from cnpgen.pipelines.resting_states import RestingStates, seeds_of
 from cnpgen.pipelines.scene_family import Grasp, Layout, SceneFamily
@@ -60,7 +60,7 @@ def shipped_families() -> dict[str, type[SceneFamily]]:
 
 
 @checked_arguments
-def load_family(name: str, parameters: Mapping[str, Any] | None = None) -> SceneFamily:
+def load_family(name: str, parameters: JsonMapping | None = None) -> SceneFamily:
     """Return a family by its name.
 
     Args:
@@ -97,7 +97,7 @@ def make_scenes(
     *,
     seed: int = 0,
     per_scene: int = 4,
-    parameters: Mapping[str, Any] | None = None,
+    parameters: JsonMapping | None = None,
     progress: Callable[[int], None] | None = None,
 ) -> list[SceneProblem]:
     """Generate planning problems in scenes of a family.
@@ -180,7 +180,7 @@ class _Generator:
     family: SceneFamily
 
     def problems(
-        self, random: np.random.Generator, name: str, count: int
+        self, random: Generator, name: str, count: int
     ) -> Iterator[SceneProblem]:
         """Yield up to ``count`` problems in one scene."""
         layout = self.family.draw(random)
@@ -212,7 +212,7 @@ class _Generator:
                 )
 
     def _grasp_states(
-        self, states: RestingStates, layout: Layout, random: np.random.Generator
+        self, states: RestingStates, layout: Layout, random: Generator
     ) -> list[Array]:
         """Return collision-free states at grasps, a few for each grasp, shape (G, n) each."""
         kinematics = PoseKinematics(self.robot)
@@ -235,10 +235,10 @@ class _Generator:
         return found
 
     def _pair(
-        self, states: RestingStates, grasps: list[Array], random: np.random.Generator
+        self, states: RestingStates, grasps: list[Array], random: Generator
     ) -> tuple[Array, Array] | None:
         """Return a start and a goal, or None after ``MAX_PAIRS`` attempts."""
-        may_be_straight = bool(random.random() < STRAIGHT_SHARE)
+        may_be_straight = random.random() < STRAIGHT_SHARE
         for _ in range(MAX_PAIRS):
             target = int(random.integers(len(grasps)))
             goal = grasps[target][random.integers(len(grasps[target]))]
@@ -252,7 +252,7 @@ class _Generator:
         return None
 
     def _start(
-        self, states: RestingStates, grasps: list[Array], random: np.random.Generator
+        self, states: RestingStates, grasps: list[Array], random: Generator
     ) -> Array | None:
         """Return a collision-free start of a random kind, or None."""
         kind = str(random.choice(list(_STARTS), p=list(_STARTS.values())))
@@ -270,7 +270,7 @@ class _Generator:
         return q if states.are_ends(q[:, None], margin=END_MARGIN_M)[0] else None
 
 
-def grasp_rotations(grasp: Grasp, count: int, random: np.random.Generator) -> Array:
+def grasp_rotations(grasp: Grasp, count: int, random: Generator) -> Array:
     """Draw rotations whose z axis is within the tilt of a grasp's approach, shape (count, 3, 3)."""
     cosine = 1 - random.uniform(size=count) * (1 - np.cos(grasp.tilt))
     angle, roll = random.uniform(-np.pi, np.pi, (2, count))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import numpy as np
+from numpy.random import Generator
 
 from cnpgen.addons.families.furniture import Furniture, place_furniture, place_objects
 from cnpgen.pipelines.scene_family import Layout, SceneFamily, length, uniform, whole
@@ -31,7 +31,7 @@ class Bookshelf(SceneFamily):
     object_width: Range = length("widths of objects", Range(0.04, 0.09), low=0.01)
     object_height: Range = length("heights of objects", Range(0.1, 0.22), low=0.01)
 
-    def draw(self, random: np.random.Generator) -> Layout:
+    def draw(self, random: Generator) -> Layout:
         """Draw boards, sides and objects."""
         shelf = place_furniture(random, self, uniform(random, self.bottom))
         width = uniform(random, self.width)
@@ -65,7 +65,7 @@ class Bookshelf(SceneFamily):
                 from_above=False,
                 prefix=f"object {level + 1}",
             )
-            y = float(random.uniform(area[2], area[3]))
+            y = random.uniform(area[2], area[3])
             # A free place in front of the objects, halfway between two boards.
             shelf.grasp((0.08, y, z + spacing / 2), (1, 0, 0), tilt=0.4)
         return shelf.layout()
@@ -121,7 +121,7 @@ class Cubby(SceneFamily):
     )
     merged: bool = field("whether two of the cells are joined", default=False)
 
-    def draw(self, random: np.random.Generator) -> Layout:
+    def draw(self, random: Generator) -> Layout:
         """Draw the walls and grasps inside of the cells."""
         cubby = place_furniture(random, self, uniform(random, self.bottom))
         width, height, depth = (
@@ -171,7 +171,7 @@ class MergedCubby(Cubby):
 
 
 def _cell_grasps(
-    random: np.random.Generator,
+    random: Generator,
     cubby: Furniture,
     depth: float,
     columns: list[tuple[float, float]],

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-import numpy as np
+from numpy.random import Generator
 
 from cnpgen.addons.families.furniture import Furniture, place_furniture, place_objects
 from cnpgen.pipelines.scene_family import Layout, SceneFamily, length, uniform, whole
@@ -33,7 +33,7 @@ class Tabletop(SceneFamily):
     object_width: Range = length("widths of objects", Range(0.05, 0.14), low=0.01)
     object_height: Range = length("heights of objects", Range(0.08, 0.35), low=0.01)
 
-    def draw(self, random: np.random.Generator) -> Layout:
+    def draw(self, random: Generator) -> Layout:
         """Draw the tables, at right angles, and their objects."""
         tables = []
         first = uniform(random, self.bearing)
@@ -67,7 +67,7 @@ class Tabletop(SceneFamily):
             for _ in range(2):  # free places
                 x = random.uniform(area[0], area[1])
                 y = random.uniform(area[2], area[3])
-                table.grasp((float(x), float(y), 0.05), (0, 0, -1))
+                table.grasp((x, y, 0.05), (0, 0, -1))
             tables.append(table)
         return tables[0].layout(*tables[1:])
 
@@ -84,7 +84,7 @@ class TablePick(SceneFamily):
     object_width: Range = length("widths of objects", Range(0.05, 0.1), low=0.01)
     object_height: Range = length("heights of objects", Range(0.1, 0.4), low=0.01)
 
-    def draw(self, random: np.random.Generator) -> Layout:
+    def draw(self, random: Generator) -> Layout:
         """Draw the table and the objects."""
         table = place_furniture(random, self, uniform(random, self.height))
         depth = 0.55
@@ -125,7 +125,7 @@ class TableUnderPick(SceneFamily):
     object_width: Range = length("widths of objects", Range(0.05, 0.09), low=0.01)
     object_height: Range = length("heights of objects", Range(0.1, 0.25), low=0.01)
 
-    def draw(self, random: np.random.Generator) -> Layout:
+    def draw(self, random: Generator) -> Layout:
         """Draw the table, the plate on which it stands, and the objects."""
         floor = uniform(random, self.floor)
         top = uniform(random, self.height)

@@ -11,9 +11,10 @@ from functools import partial
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from cnpgen.addons.frameworks.host_evaluation import evaluate
+from cnpgen.arrays import Array
 from cnpgen.errors import UsageError, requires_extra
 from cnpgen.loader.batch import Batch
 from cnpgen.losses.plan_loss import PlanLoss
@@ -294,5 +295,5 @@ def _real(name: str, values: Any, dtype: Any) -> jax.Array:
     return array.astype(dtype)
 
 
-def _wide(values: Any) -> NDArray[np.float64]:
+def _wide(values: Any) -> Array:
     return np.asarray(values, np.float64)

@@ -1,8 +1,7 @@
 """The card of a dataset: the README.md for users and the Hugging Face hub."""
 
 import json
-from collections.abc import Mapping, Sequence
-from typing import Any
+from collections.abc import Sequence
 
 import numpy as np
 
@@ -14,6 +13,7 @@ from cnpgen.addons.hub.card_problem import (
     what_samples_prove,
 )
 from cnpgen.addons.hub.markdown import markdown_table
+from cnpgen.arrays import JsonMapping, TextRows
 from cnpgen.problems.constraints.joint import judged_torque
 from cnpgen.problems.problem_record import as_record, open_problem
 from cnpgen.robots.drive import RIGID
@@ -140,7 +140,7 @@ def card_notes(card: str) -> str:
     return notes.strip()
 
 
-def _origin(recipe: Mapping[str, Any]) -> str:
+def _origin(recipe: JsonMapping) -> str:
     """Return the authors and the citation of a recipe."""
     creator, citation = (
         str(recipe.get(key, "")).strip() for key in ("creator", "citation")
@@ -313,7 +313,7 @@ def _range_table(
     return markdown_table(head, rows)
 
 
-def _range_rows(field: Field, statistics: FieldStatistics) -> list[tuple[str, ...]]:
+def _range_rows(field: Field, statistics: FieldStatistics) -> TextRows:
     """Return one row per column of a field."""
     numbers = np.stack(
         [statistics.minimum, statistics.maximum, statistics.mean, statistics.std],

@@ -8,8 +8,8 @@ also listed as ``variableMeasured`` of schema.org, which Croissant documents may
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
 
+from cnpgen.arrays import JsonObject
 from cnpgen.store.dataset_summary import DatasetSummary
 from cnpgen.store.field import Field
 from cnpgen.store.scene_table import SCENE_ARRAYS
@@ -20,7 +20,7 @@ def _terms(names: str) -> dict[str, str]:
     return {name: f"cr:{name}" for name in names.split()}
 
 
-_CONTEXT: dict[str, Any] = {
+_CONTEXT: JsonObject = {
     "@language": "en",
     "@vocab": "https://schema.org/",
     **_terms("arrayShape citeAs column"),
@@ -49,7 +49,7 @@ class SplitFile:
     sha256: str
 
 
-def croissant_document(summary: DatasetSummary, *, created: str) -> dict[str, Any]:
+def croissant_document(summary: DatasetSummary, *, created: str) -> JsonObject:
     """Return the content of ``croissant.json`` of a dataset, created at an ISO 8601 time."""
     splits = {
         split: [
@@ -68,7 +68,7 @@ def croissant_of_tables(
     *,
     created: str,
     url: str,
-) -> dict[str, Any]:
+) -> JsonObject:
     """Return the content of ``croissant.json`` of a repository of Parquet tables."""
     records = _records(summary, tables, "x-parquet", "*/{}/*.parquet")
     return _document(summary, created) | {"url": url, **records}
@@ -79,7 +79,7 @@ def _records(
     splits: Mapping[str, Sequence[SplitFile]],
     encoding: str,
     pattern: str,
-) -> dict[str, Any]:
+) -> JsonObject:
     """Describe the files of all splits, with a record set for each split; "{}" in the pattern of paths is the split."""
     distribution = []
     records = []
@@ -107,7 +107,7 @@ def _records(
     return {"distribution": distribution, "recordSet": records}
 
 
-def _field(field: Field, split: str, files: str) -> dict[str, Any]:
+def _field(field: Field, split: str, files: str) -> JsonObject:
     """Describe a column of a split's files."""
     source = {"fileSet": {"@id": files}, "extract": {"column": field.name}}
     # A width of 0 is a column of single numbers.
@@ -123,10 +123,10 @@ def _field(field: Field, split: str, files: str) -> dict[str, Any]:
     }
 
 
-def _document(summary: DatasetSummary, created: str) -> dict[str, Any]:
+def _document(summary: DatasetSummary, created: str) -> JsonObject:
     """Return the metadata and the variables of a dataset."""
     spec = summary.spec
-    document: dict[str, Any] = {
+    document: JsonObject = {
         "@context": _CONTEXT,
         "@type": "sc:Dataset",
         "conformsTo": "http://mlcommons.org/croissant/1.1",
@@ -145,7 +145,7 @@ def _document(summary: DatasetSummary, created: str) -> dict[str, Any]:
     return document | {"variableMeasured": variables}
 
 
-def _variables(field: Field) -> Iterator[dict[str, Any]]:
+def _variables(field: Field) -> Iterator[JsonObject]:
     """Describe the components of a field, each with its unit and limits."""
     for index, (name, unit) in enumerate(zip(field.columns, field.units, strict=True)):
         limits = {"minValue": field.valid_min, "maxValue": field.valid_max}

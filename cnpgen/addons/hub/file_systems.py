@@ -102,8 +102,10 @@ def download(url: str) -> Path:
         MachineError: The server cannot be reached, or the download was interrupted.
     """
     if "?" in url or "#" in url:
-        text = f"{url:.200}: expected the URL of a folder, without a query or an anchor"
-        raise UsageError(text, concerns="folder")
+        raise UsageError(
+            f"{url:.200}: expected the URL of a folder, without a query or an anchor",
+            concerns="folder",
+        )
     remote = _open_folder(url.rstrip("/"))
     # The dataset is at the URL itself, or in a repository of ``publish_dataset``.
     for folder in (remote, replace(remote, path=f"{remote.path}/{HDF5}")):
@@ -124,8 +126,9 @@ def _open_folder(url: str) -> FileSystemFolder:
         return FileSystemFolder(shown, *fsspec.url_to_fs(url))
     except ImportError as error:
         package = _PACKAGES.get(scheme, "'cnpgen[hub]'")
-        text = f"{scheme}:// needs a package that is missing: pip install {package}"
-        raise MissingExtraError(text) from error
+        raise MissingExtraError(
+            f"{scheme}:// needs a package that is missing: pip install {package}"
+        ) from error
 
 
 def _read_manifest(folder: FileSystemFolder) -> bytes:

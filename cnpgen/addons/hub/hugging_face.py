@@ -85,8 +85,10 @@ def download(url: str) -> Path:
     """
     parts = _URL.fullmatch(url)
     if parts is None:
-        text = f"expected hf://datasets/USER/NAME@REVISION, got {url:.200}"
-        raise UsageError(text, concerns="folder")
+        raise UsageError(
+            f"expected hf://datasets/USER/NAME@REVISION, got {url:.200}",
+            concerns="folder",
+        )
     revision = parts["revision"] and urllib.parse.unquote(parts["revision"])
     inside = f"{parts['folder']}/" if parts["folder"] else ""
     with requires_extra("hub", "huggingface_hub"):
@@ -120,9 +122,10 @@ def _manifest(remote: HubFolder) -> Path | None:
     except EntryNotFoundError:
         return None
     except (RepositoryNotFoundError, RevisionNotFoundError) as error:
-        text = f"{remote.url} was not found; a private repository needs HF_TOKEN or 'hf auth login'"
-        raise UsageError(text, concerns="folder") from error
+        raise UsageError(
+            f"{remote.url} was not found; a private repository needs HF_TOKEN or 'hf auth login'",
+            concerns="folder",
+        ) from error
     except (OSError, ValueError) as error:
         # The others of huggingface_hub.
-        text = f"{remote.url} cannot be read: {error!s:.300}"
-        raise MachineError(text) from error
+        raise MachineError(f"{remote.url} cannot be read: {error!s:.300}") from error

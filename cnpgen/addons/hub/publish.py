@@ -124,7 +124,8 @@ def write_repository(
         link_or_copy(source / name, target / HDF5 / name)
     notes = card_notes((source / CARD).read_text(encoding="utf-8"))
     summary = summarize_dataset(source, spec)
-    created, url = load_manifest(source)["created"], f"{HUB}/datasets/{repository}"
+    created = load_manifest(source)["created"]
+    url = f"{HUB}/datasets/{repository}"
     plot_dataset(inspect_dataset(source), target / PICTURE)
     card = card_text(
         summary,

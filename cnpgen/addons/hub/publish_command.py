@@ -41,8 +41,11 @@ def add_options(parser: Parser) -> None:
     option(
         "--dry-run", action="store_true", help="write the folder, but upload nothing"
     )
-    text = "keep other files in FOLDER, and replace those with a name of the repository"
-    option("--force", action="store_true", help=text)
+    option(
+        "--force",
+        action="store_true",
+        help="keep other files in FOLDER, and replace those with a name of the repository",
+    )
 
 
 def run(arguments: argparse.Namespace) -> None:

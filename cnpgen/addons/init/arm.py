@@ -12,6 +12,7 @@ from xml.etree.ElementTree import Element
 import numpy as np
 
 from cnpgen.addons.init.doubts import doubts
+from cnpgen.arrays import NamedNumbers, Names
 from cnpgen.errors import RecipeError, UsageError, listed
 from cnpgen.problems.checks import frames_of, missing_frame, unread_xacro
 from cnpgen.problems.urdf_dynamics import (
@@ -51,8 +52,9 @@ class ArmJoint:
     velocity: float  # limit [rad/s or m/s]
     effort: float  # limit of the torque or force [N m or N]; 0 where the URDF has none
     # Limits that the URDF does not have: "position", "velocity", "torque".
-    missing: tuple[str, ...]
-    replaced: tuple[str, ...] = ()  # limits of the same names that another file states
+    missing: Names
+    replaced: Names = ()  # limits of the same names that another file states
+    jerk: float = math.inf  # limit of a URDF 1.2 [rad/s^3 or m/s^3]
 
 
 @dataclass(frozen=True)
@@ -63,20 +65,20 @@ class Arm:
     tip: str  # frame
     # Joints between the root and the tip, from the root outwards.
     planned: tuple[ArmJoint, ...]
-    locked: tuple[str, ...]  # names of all other joints that move: they stay at zero
-    moved: tuple[str, ...]  # links that planned joints move
-    frames: tuple[str, ...]  # names of all links and joints
-    masses: Mapping[str, float]  # link -> mass [kg]; 0 where it has none
+    locked: Names  # names of all other joints that move: they stay at zero
+    moved: Names  # links that planned joints move
+    frames: Names  # names of all links and joints
+    masses: NamedNumbers  # link -> mass [kg]; 0 where it has none
     # Links that planned joints move with inertias that no body has.
-    impossible: tuple[str, ...]
-    shaped: tuple[str, ...]  # links that have a ``<collision>`` element
-    meshes: tuple[str, ...]  # mesh files that links name
-    visual: tuple[str, ...]  # links that have a ``<visual>`` and no ``<collision>``
+    impossible: Names
+    shaped: Names  # links that have a ``<collision>`` element
+    meshes: Names  # mesh files that links name
+    visual: Names  # links that have a ``<visual>`` and no ``<collision>``
     # Locked joints that do not stay at zero -> position [rad or m].
-    locked_positions: Mapping[str, float]
-    doubts: tuple[str, ...]  # sentences about numbers that are probably wrong
+    locked_positions: NamedNumbers
+    doubts: Names  # sentences about numbers that are probably wrong
     friction: tuple[JointFriction, ...]  # friction of planned joints that have any
-    joint_notes: tuple[str, ...]  # about further elements of planned joints
+    joint_notes: Names  # about further elements of planned joints
 
     @property
     def urdf_dynamics(self) -> str:
@@ -156,7 +158,7 @@ def _tree_and_parameters(urdf: Path) -> tuple[Element, UrdfParameters]:
     return tree, parameters
 
 
-def _links_with(tree: Element, tag: str) -> tuple[str, ...]:
+def _links_with(tree: Element, tag: str) -> Names:
     """Return the names of the links that have an element."""
     return tuple(
         link.get("name", "")
@@ -165,7 +167,7 @@ def _links_with(tree: Element, tag: str) -> tuple[str, ...]:
     )
 
 
-def _doubts(urdf: Path, tree: Element) -> tuple[str, ...]:
+def _doubts(urdf: Path, tree: Element) -> Names:
     try:
         return tuple(doubts(tree))
     except ValueError as error:
@@ -326,4 +328,5 @@ def _joint(joint: UrdfJoint) -> ArmJoint:
         velocity=DEFAULT_SPEED if missing["velocity"] else velocity,
         effort=effort,
         missing=tuple(name for name, is_missing in missing.items() if is_missing),
+        jerk=joint.rates.get("jerk", math.inf),
     )

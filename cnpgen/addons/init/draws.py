@@ -4,9 +4,8 @@ import math
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
-from cnpgen.arrays import Array
+from cnpgen.arrays import Array, Mask, Names
 from cnpgen.errors import RecipeError
 from cnpgen.kernels.library import choose_backend
 from cnpgen.pipelines.pipeline import Pipeline
@@ -36,9 +35,7 @@ ROUNDING_M = 1e-3  # of the corners of boxes
 MIN_TIP_TRAVEL_M = 1e-6  # a tip that moves less along an axis does not move along it
 
 
-def comfortable_base(
-    problem: Problem, robot: Robot
-) -> tuple[tuple[float, ...], tuple[str, ...]]:
+def comfortable_base(problem: Problem, robot: Robot) -> tuple[tuple[float, ...], Names]:
     """Find a configuration with the tip in front of the robot, far from its limits and with high manipulability.
 
     Random states with the tip ahead along x and above the ground are preferred. The
@@ -71,7 +68,7 @@ def comfortable_base(
         for k in order[(group & free)[order]][:MAX_CLEARANCE_CHECKS]:
             if _clearance(world, states[k]) > MIN_LINK_CLEARANCE_M:
                 return tuple(states[k].tolist()), ()
-    notes: tuple[str, ...] = ()
+    notes: Names = ()
     if not (groups[2] & free).any():
         text = f"in all of {BASE_CANDIDATES:,} random states links collide or gravity needs too much torque"
         notes = (f"{text}: choose the base configuration by hand",)
@@ -94,7 +91,7 @@ def _scores(robot: Robot, states: Array, values: Array) -> Array:
     return np.asarray(values[:, moves].prod(axis=1) * (1 - np.abs(offsets).max(axis=1)))
 
 
-def _are_in_front(robot: Robot, tips: Array) -> NDArray[np.bool_]:
+def _are_in_front(robot: Robot, tips: Array) -> Mask:
     """Return a mask of the tips ahead of the first joint along x and above the ground, shape (N,)."""
     x, y, _ = (tips - robot.chain.joints[0].translation).T
     return np.asarray((x > 0) & (np.abs(y) <= 0.2 * x) & (tips[:, 2] >= 0))
@@ -105,12 +102,9 @@ def _states(robot: Robot) -> Array:
     shares = np.random.default_rng(0).uniform(
         LIMIT_SHARE, 1 - LIMIT_SHARE, (BASE_CANDIDATES, robot.n)
     )
-    return np.asarray(
-        (
-            robot.position_lower
-            + shares * (robot.position_upper - robot.position_lower)
-        ).round(3)
-    )
+    return (
+        robot.position_lower + shares * (robot.position_upper - robot.position_lower)
+    ).round(3)
 
 
 def _measure_states(world: World, states: Array) -> tuple[Array, Array, Array]:
@@ -127,7 +121,7 @@ def _measure_states(world: World, states: Array) -> tuple[Array, Array, Array]:
     return np.array(tips), np.array(values), np.array(load)
 
 
-def _free_states(robot: Robot, states: Array) -> NDArray[np.bool_]:
+def _free_states(robot: Robot, states: Array) -> Mask:
     """Return a mask of the states without collisions of links, shape (N,)."""
     free = np.ones(len(states), bool)
     shape = robot.shape
@@ -191,9 +185,7 @@ def find_boxes(pipeline: Pipeline) -> tuple[Pipeline, float]:
     return best, share
 
 
-def _boxes(
-    centre: Array, edge: float, moves: NDArray[np.bool_], distance: float
-) -> DrawPositions:
+def _boxes(centre: Array, edge: float, moves: Mask, distance: float) -> DrawPositions:
     """Return two boxes side by side, along y if the tip moves along it.
 
     Flat along axes along which it does not.

@@ -12,9 +12,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from cnpgen.arrays import Array
+from cnpgen.arrays import Array, Integers
 from cnpgen.errors import RecipeError
 from cnpgen.robots.chain import frame_of
 from cnpgen.robots.shape.convex_part import ConvexPart, convex_part_of, origin_of
@@ -188,7 +187,7 @@ def _exact_body(part: ConvexPart) -> CollisionBody:
     return CollisionBody(*ball_round(part.vertices, part.radius), geometry, placement)
 
 
-def _triangles(points: Array, sides: NDArray[np.int64]) -> Any:
+def _triangles(points: Array, sides: Integers) -> Any:
     """Return a triangle mesh as an object of Coal."""
     import coal
 

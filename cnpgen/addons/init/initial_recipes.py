@@ -17,7 +17,7 @@ from cnpgen.addons.init.stated_sources import (
     TORQUE_STATES,
     stated_sources,
 )
-from cnpgen.arrays import Array
+from cnpgen.arrays import Array, Names
 from cnpgen.errors import RecipeError
 from cnpgen.make.recipe import DatasetRecipe
 from cnpgen.pipelines.pipeline import Pipeline
@@ -63,7 +63,7 @@ class InitialProblem:
     problem: Problem
     arm: Arm  # with placeholders of missing limits
     overlaps: LinkOverlaps | None  # None without link geometry
-    notes: tuple[str, ...]
+    notes: Names
 
 
 def problem_of(
@@ -73,8 +73,8 @@ def problem_of(
     packages: tuple[Path, ...],
     srdf: Path | None,
     *,
-    skipped_meshes: tuple[str, ...] = (),
-    allow_unused: tuple[str, ...] = (),
+    skipped_meshes: Names = (),
+    allow_unused: Names = (),
     joint_limits: StatedJointLimits | None = None,
 ) -> InitialProblem:
     """Make the problem of an arm, or raise RecipeError if it cannot be planned for.
@@ -105,7 +105,7 @@ def problem_of(
         problem.limits, torque_scale=scale, **_replaced_limits(arm, joint_limits, robot)
     )
     problem = replace(problem, limits=limits)
-    problem = _with_jerk_limits(problem, robot, joint_limits)
+    problem = _with_jerk_limits(problem, robot, arm, joint_limits)
     sources = stated_sources(arm, problem.limits, joint_limits)
     problem = replace(problem, limits=replace(problem.limits, sources=sources))
     problem, torque_notes = _with_torque(problem, robot)
@@ -115,7 +115,7 @@ def problem_of(
     return InitialProblem(problem, arm, overlaps, every)
 
 
-def _with_torque(problem: Problem, robot: Robot) -> tuple[Problem, tuple[str, ...]]:
+def _with_torque(problem: Problem, robot: Robot) -> tuple[Problem, Names]:
     """Return a problem with the limit of torques, or a note of the reason why it is omitted."""
     # Torques of links without masses are meaningless.
     if not robot.chain.joints[-1].mass > 0:
@@ -127,7 +127,7 @@ def _with_torque(problem: Problem, robot: Robot) -> tuple[Problem, tuple[str, ..
     return replace(problem, constraint=constraints), ()
 
 
-def _check_allowed(keys: tuple[str, ...], urdf: Path, srdf: Path | None) -> None:
+def _check_allowed(keys: Names, urdf: Path, srdf: Path | None) -> None:
     """Raise UsageError for names that neither file has as those of parts that are not read."""
     unread = unknown_names(urdf_tree(read_urdf(urdf)))
     if srdf is not None and keys:
@@ -163,7 +163,7 @@ def _problem(
     packages: tuple[Path, ...],
     srdf: Path | None,
     *,
-    skipped_meshes: tuple[str, ...],
+    skipped_meshes: Names,
 ) -> Problem:
     """Return the problem without torques, with the base configuration at the centre of all limits."""
     centre = tuple((joint.lower + joint.upper) / 2 for joint in arm.planned)
@@ -281,11 +281,14 @@ def _with_torque_limits(arm: Arm, robot: Robot) -> tuple[Arm, float, list[str]]:
 
 
 def _with_jerk_limits(
-    problem: Problem, robot: Robot, joint_limits: StatedJointLimits | None
+    problem: Problem,
+    robot: Robot,
+    arm: Arm,
+    joint_limits: StatedJointLimits | None,
 ) -> Problem:
-    """Return the problem with jerk limits in proportion to the acceleration limits, or those of a file.
+    """Return the problem with jerk limits of a file, or in proportion to the accelerations.
 
-    URDFs have none.
+    The latter are at most those of a URDF 1.2.
     """
     stated = {} if joint_limits is None else joint_limits.of("max_jerk")
     accelerations = problem.limits.acceleration
@@ -295,8 +298,10 @@ def _with_jerk_limits(
         else accelerations.values
     )
     jerks = tuple(
-        stated.get(name, float(f"{INITIAL_JERK_RATE * limit:.3g}"))
-        for name, limit in zip(robot.joint_names, limits_of, strict=True)
+        stated.get(
+            joint.name, min(float(f"{INITIAL_JERK_RATE * limit:.3g}"), joint.jerk)
+        )
+        for joint, limit in zip(arm.planned, limits_of, strict=True)
     )
     limits = replace(problem.limits, jerk=PerJoint(jerks))
     *others, acceleration = problem.constraint[:3]

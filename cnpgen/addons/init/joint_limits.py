@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from cnpgen.addons.init.arm import Arm, ArmJoint
+from cnpgen.arrays import NamedNumbers, Names
 from cnpgen.errors import UsageError, nearest
 from cnpgen.problems.scenes.yaml_document import read_yaml
 
@@ -26,8 +27,8 @@ class StatedJointLimits:
     """Limits of a file for the joints of an arm, by joint and key; only those whose flag is true."""
 
     path: Path
-    values: Mapping[str, Mapping[str, float]]
-    unused: tuple[str, ...] = ()  # sentences about elements of the file
+    values: Mapping[str, NamedNumbers]
+    unused: Names = ()  # sentences about elements of the file
 
     def of(self, key: str) -> dict[str, float]:
         """Return the values of a key: joint -> limit."""
@@ -36,7 +37,7 @@ class StatedJointLimits:
         }
 
 
-def read_joint_limits(path: Path, joints: tuple[str, ...]) -> StatedJointLimits:
+def read_joint_limits(path: Path, joints: Names) -> StatedJointLimits:
     """Read a joint_limits.yaml for the joints of a robot.
 
     Raises:

@@ -54,10 +54,19 @@ def stated_sources(
     for limit, rule in rules.items():
         of_file = {} if joint_limits is None else joint_limits.of(f"max_{limit}")
         stated = [name for name in names if name in of_file]
-        others = [name for name in names if name not in of_file]
+        urdf = _of_urdf(arm, limits) if limit == "jerk" else []
+        urdf = [name for name in urdf if name not in of_file]
+        others = [name for name in names if name not in {*of_file, *urdf}]
         if getattr(limits, limit) is not None:
-            sources[limit] = _source((file, stated), ("", []), (rule, others))
+            sources[limit] = _source((file, stated), ("the URDF", urdf), (rule, others))
     return LimitSources(**sources)
+
+
+def _of_urdf(arm: Arm, limits: LimitSpec) -> list[str]:
+    """Return the joints whose jerk limit is that of the URDF."""
+    jerks = () if limits.jerk is None else limits.jerk.values
+    pairs = zip(arm.planned, jerks, strict=False)
+    return [joint.name for joint, jerk in pairs if jerk == joint.jerk]
 
 
 def _source(

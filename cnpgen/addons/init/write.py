@@ -14,7 +14,9 @@ from cnpgen.addons.init.link_overlaps import MAX_PAIR_GAP, LinkOverlaps
 from cnpgen.addons.init.stated_sources import INITIAL_JERK_RATE, PLACEHOLDERS
 from cnpgen.addons.manual.describe import link_rows, pair_rows, with_units
 from cnpgen.addons.manual.describe_keys import GROUPS, is_array, kind_summary, part_of
+from cnpgen.arrays import JsonMapping, JsonObject, Names, TextRows
 from cnpgen.cli.terminal import table
+from cnpgen.errors import counted
 from cnpgen.make.recipe import DatasetRecipe
 from cnpgen.problems.load_robot import load_robot
 from cnpgen.robots.robot import Robot
@@ -36,7 +38,7 @@ def problem_text(initial: InitialProblem, folder: Path) -> str:
     """Write the problem of an arm in a folder, with findings about the arm."""
     problem = initial.problem
     arm = initial.arm
-    places: dict[str, Any] = {"robot.urdf": _from(folder, problem.robot.urdf)}
+    places: JsonObject = {"robot.urdf": _from(folder, problem.robot.urdf)}
     places["robot.packages"] = tuple(
         _from(folder, each) for each in problem.robot.packages
     )
@@ -119,9 +121,7 @@ def _about(initial: InitialProblem, robot: Robot) -> Iterator[str]:
         yield from _titled(title, rows, (2, 3, 4, 5))
 
 
-def _titled(
-    title: str, rows: list[tuple[str, ...]], right: Sequence[int]
-) -> Iterator[str]:
+def _titled(title: str, rows: TextRows, right: Sequence[int]) -> Iterator[str]:
     """Yield a table below its title, with the columns that are aligned to the right."""
     yield from ("#", f"#   {title}", "#")
     yield from table(rows, indent="#   ", right=right)
@@ -142,7 +142,8 @@ def _facts(arm: Arm, robot: Robot) -> list[tuple[str, str]]:
     facts += [
         (
             "mass",
-            f"{mass:.4g} kg in {len(heavy)} links that move; without any: {', '.join(light) or 'none'}",
+            f"{mass:.4g} kg in {counted(len(heavy), 'moving link')}; "
+            f"moving links without mass: {', '.join(light) or 'none'}",
         )
     ]
     if not robot.chain.joints[-1].mass:
@@ -163,7 +164,7 @@ def _facts(arm: Arm, robot: Robot) -> list[tuple[str, str]]:
     return facts
 
 
-def _gap_rows(overlaps: LinkOverlaps) -> list[tuple[str, ...]]:
+def _gap_rows(overlaps: LinkOverlaps) -> TextRows:
     """List the pairs with a gap: shares of random states, and of those that all meshes accept."""
     hulls = {(pair.first, pair.second): pair for pair in overlaps.hulls.pairs}
     rows = [
@@ -189,7 +190,7 @@ def _gap_rows(overlaps: LinkOverlaps) -> list[tuple[str, ...]]:
     return [head, *rows] if rows else []
 
 
-def _joint_rows(arm: Arm) -> Iterator[tuple[str, ...]]:
+def _joint_rows(arm: Arm) -> Iterator[Names]:
     prismatic = tuple(joint.kind == "prismatic" for joint in arm.planned)
     limits = {
         ("position", "rad"): [
@@ -211,9 +212,7 @@ def _joint_rows(arm: Arm) -> Iterator[tuple[str, ...]]:
     )
 
 
-def recipe_text(
-    recipe: Any, values: Mapping[str, Any], notes: Mapping[str, str]
-) -> str:
+def recipe_text(recipe: Any, values: JsonMapping, notes: Mapping[str, str]) -> str:
     """Write a problem, pipeline or dataset, with other values of keys, such as "robot.urdf", and notes on keys."""
     return "\n".join(_Writer(values, notes).table(type(recipe), recipe, "")) + "\n"
 
@@ -225,7 +224,7 @@ class _Writer:
     What is left out has ``# `` before it.
     """
 
-    values: Mapping[str, Any]
+    values: JsonMapping
     notes: Mapping[str, str]
 
     def table(self, cls: type, table: Any, path: str) -> Iterator[str]:

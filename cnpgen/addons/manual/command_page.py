@@ -25,10 +25,13 @@ def command_page() -> str:
     for name, command in commands.choices.items():
         parts += [
             f"## `cnpgen {name}`",
-            escaped(command.description),
+            _with_code(escaped(command.description)),
             *_tables(command),
         ]
-        parts += [f"```\n{command.epilog.strip()}\n```"] if command.epilog else []
+        paragraphs = (command.epilog or "").split("\n\n")
+        parts += [
+            _with_code(escaped(" ".join(text.split()))) for text in paragraphs if text
+        ]
     codes = str(parser.epilog).partition("Exit codes:\n")[2]
     rows = [
         " ".join(row.split()).partition(" ")
@@ -60,8 +63,17 @@ def _tables(command: argparse.ArgumentParser) -> Iterator[str]:
         if actions:
             yield reference_table(
                 (head, "description"),
-                [(f"`{_spelling(action)}`", _help(action)) for action in actions],
+                [
+                    (f"`{_spelling(action)}`", _with_code(_help(action)))
+                    for action in actions
+                ],
             )
+
+
+def _with_code(text: str) -> str:
+    """Write the commands and options of a text as code."""
+    names = r"'(?P<command>cnpgen [^']*)'|(?<![\w-])(?P<option>--[a-z][\w-]*)"
+    return re.sub(names, lambda name: f"`{name['command'] or name['option']}`", text)
 
 
 def _spelling(action: argparse.Action) -> str:

@@ -5,6 +5,7 @@ from collections.abc import Sequence
 from textwrap import wrap
 from typing import Any
 
+from cnpgen.arrays import JsonObject, TextRows
 from cnpgen.cli.terminal import LINE_WIDTH, table
 from cnpgen.make.any_recipe import Recipe
 from cnpgen.make.recipe import DatasetRecipe, recipe_digest
@@ -167,7 +168,7 @@ def _drive(problem: Problem, robot: Robot) -> list[str]:
     ]
 
 
-def _drive_rows(robot: Robot, drive: Drive) -> list[tuple[str, ...]]:
+def _drive_rows(robot: Robot, drive: Drive) -> TextRows:
     """List the drive of every joint."""
     columns = [
         ("rotor inertia", "kg m^2", drive.armature),
@@ -220,7 +221,7 @@ def _shape(problem: Problem, robot: Robot) -> list[str]:
     ]
 
 
-def link_rows(shape: Shape) -> list[tuple[str, ...]]:
+def link_rows(shape: Shape) -> TextRows:
     """List the links: numbers of convex parts and corners, and the capsule that covers them."""
     head = (
         "link",
@@ -231,7 +232,7 @@ def link_rows(shape: Shape) -> list[tuple[str, ...]]:
         "overhang [mm]",
         "joint",
     )
-    rows: list[tuple[str, ...]] = [head]
+    rows: TextRows = [head]
     for capsule in shape.capsules:
         parts = [part for part in shape.convex_parts if part.link == capsule.link]
         corners = sum(len(part.vertices) for part in parts)
@@ -252,7 +253,7 @@ def link_rows(shape: Shape) -> list[tuple[str, ...]]:
     return rows
 
 
-def pair_rows(shape: Shape) -> list[tuple[str, ...]]:
+def pair_rows(shape: Shape) -> TextRows:
     """List the pairs of links: share of random states in which they collide, and their users."""
     head = ("links", "", "colliding", "false capsule contacts", "checked by")
     return [
@@ -278,7 +279,7 @@ def _use(pair: LinkPair) -> str:
     return "judges and solvers" if pair.for_solvers else "judges"
 
 
-def shape_to_dict(shape: Shape) -> dict[str, Any]:
+def shape_to_dict(shape: Shape) -> JsonObject:
     """Return links and pairs for JSON, in SI units."""
     capsules = [
         {
@@ -307,7 +308,7 @@ def shape_to_dict(shape: Shape) -> dict[str, Any]:
     return {"links": capsules, "pairs": pairs}
 
 
-def _limit_rows(problem: Problem, robot: Robot) -> list[tuple[str, ...]]:
+def _limit_rows(problem: Problem, robot: Robot) -> TextRows:
     """List the limits of every joint; the jerk limit if the problem limits jerks."""
     ends = zip(robot.position_lower, robot.position_upper, strict=True)
     columns = [
@@ -326,7 +327,7 @@ def _limit_rows(problem: Problem, robot: Robot) -> list[tuple[str, ...]]:
     return list(zip(("joint", "", *robot.joint_names), *shown, strict=True))
 
 
-def _source_rows(problem: Problem, robot: Robot) -> list[tuple[str, ...]]:
+def _source_rows(problem: Problem, robot: Robot) -> TextRows:
     """List who states each limit; that of jerks as in the table of limits."""
     return [
         (name, WORDS[each.basis], each.source)
@@ -402,7 +403,7 @@ def kind_name(item: Stage | Constraint) -> str:
     return registry.name_of(group, type(item))
 
 
-def model_to_dict(model: Model) -> dict[str, Any]:
+def model_to_dict(model: Model) -> JsonObject:
     """Describe a model for JSON: its problem, its network, and whether motions may end with an acceleration."""
     return {
         "kind": "model",
@@ -412,7 +413,7 @@ def model_to_dict(model: Model) -> dict[str, Any]:
     }
 
 
-def describe_model(facts: dict[str, Any]) -> str:
+def describe_model(facts: JsonObject) -> str:
     """Describe a model in two lines."""
     text = {
         "free": "motions may end with a step of acceleration",
@@ -424,7 +425,7 @@ def describe_model(facts: dict[str, Any]) -> str:
     )
 
 
-def recipe_to_dict(recipe: Recipe) -> dict[str, Any]:
+def recipe_to_dict(recipe: Recipe) -> JsonObject:
     """Describe a recipe for JSON: everything it refers to resolved, in SI units, with derived values."""
     # A data set has a pipeline, and a pipeline has a problem.
     pipeline = recipe.pipeline if isinstance(recipe, DatasetRecipe) else recipe
@@ -433,7 +434,7 @@ def recipe_to_dict(recipe: Recipe) -> dict[str, Any]:
     kind = {Problem: "problem", Pipeline: "pipeline", DatasetRecipe: "dataset"}[
         type(recipe)
     ]
-    content: dict[str, Any] = {
+    content: JsonObject = {
         "kind": kind,
         "file": str(recipe.path),
         "recipe": resolved(recipe),

@@ -2,9 +2,10 @@
 
 import dataclasses
 from collections.abc import Sequence
-from typing import Any, get_args
+from typing import get_args
 
 from cnpgen.addons.manual.describe import quantity, title_lines
+from cnpgen.arrays import JsonObject
 from cnpgen.cli.terminal import table
 from cnpgen.make.recipe import DatasetRecipe
 from cnpgen.pipelines.pipeline import Pipeline
@@ -67,7 +68,7 @@ def describe_kind(group: str, name: str) -> str:
     )
 
 
-def kind_to_dict(group: str, name: str) -> dict[str, Any]:
+def kind_to_dict(group: str, name: str) -> JsonObject:
     """Describe a kind of stage or constraint for JSON."""
     return {
         "kind": registry.noun_of(group),
@@ -76,7 +77,7 @@ def kind_to_dict(group: str, name: str) -> dict[str, Any]:
     }
 
 
-def keys_to_dict(kinds: Sequence[Kind]) -> dict[str, Any]:
+def keys_to_dict(kinds: Sequence[Kind]) -> JsonObject:
     """Describe all keys of files of some kinds for JSON.
 
     Of a table of tables each has its own keys.
@@ -130,14 +131,14 @@ def expected_text(key: Key) -> str:
     return ", ".join([key.expected, *limits])
 
 
-def _table_to_dict(cls: type) -> dict[str, Any]:
+def _table_to_dict(cls: type) -> JsonObject:
     return {
         "summary": kind_summary(cls),
         "keys": [_key_to_dict(key) for key in keys(cls)],
     }
 
 
-def _key_to_dict(key: Key) -> dict[str, Any]:
+def _key_to_dict(key: Key) -> JsonObject:
     """Describe a key, and the table or the tables that it holds."""
     left_out = ("hint", "default", "since_version")
     part = part_of(key)

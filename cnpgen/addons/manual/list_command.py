@@ -2,11 +2,11 @@
 
 import argparse
 from pathlib import Path
-from typing import Any
 
+from cnpgen.arrays import JsonObject
 from cnpgen.cli.parser import Parser, add_json
 from cnpgen.cli.terminal import table
-from cnpgen.errors import RecipeError
+from cnpgen.errors import RecipeError, counted
 from cnpgen.schema.toml import Kind
 
 _HOW = {
@@ -49,7 +49,7 @@ def run(arguments: argparse.Namespace) -> None:
     )
 
 
-def list_all(what: str) -> list[dict[str, Any]]:
+def list_all(what: str) -> list[JsonObject]:
     """List the recipes of one kind, the models, or a group of kinds, of ``WHAT``, with name, title and size."""
     files = files_of(what)
     if files is None:
@@ -92,7 +92,7 @@ def files_of(what: str) -> dict[str, Path] | None:
     return list_recipes(kinds[what]) if what in kinds else None
 
 
-def _dataset(name: str, _: Path) -> dict[str, Any]:
+def _dataset(name: str, _: Path) -> JsonObject:
     from cnpgen.make.recipe import load_dataset_recipe
 
     recipe = load_dataset_recipe(name)
@@ -102,10 +102,10 @@ def _dataset(name: str, _: Path) -> dict[str, Any]:
         "version": recipe.version,
         "pipeline": recipe.pipeline.name,
     }
-    return about | {"size": f"{rows:,} rows", "rows": rows, "splits": recipe.splits}
+    return about | {"size": counted(rows, "row"), "rows": rows, "splits": recipe.splits}
 
 
-def _model(name: str, file: Path) -> dict[str, Any]:
+def _model(name: str, file: Path) -> JsonObject:
     """Describe a model by its name, which is that of its dataset.
 
     Reading the file would load HDF5.
@@ -118,7 +118,7 @@ def _model(name: str, file: Path) -> dict[str, Any]:
     }
 
 
-def _pipeline(name: str, _: Path) -> dict[str, Any]:
+def _pipeline(name: str, _: Path) -> JsonObject:
     from cnpgen.pipelines.pipeline import load_pipeline
 
     recipe = load_pipeline(name)
@@ -126,12 +126,12 @@ def _pipeline(name: str, _: Path) -> dict[str, Any]:
     return {
         "title": recipe.title,
         "problem": recipe.problem.name,
-        "size": f"{count} stages",
+        "size": counted(count, "stage"),
         "stages": count,
     }
 
 
-def _problem(name: str, _: Path) -> dict[str, Any]:
+def _problem(name: str, _: Path) -> JsonObject:
     from cnpgen.problems.problem_file import load_problem
 
     recipe = load_problem(name)
@@ -140,7 +140,7 @@ def _problem(name: str, _: Path) -> dict[str, Any]:
     return {"title": recipe.title, "size": size, **count}
 
 
-def _suite(_: str, file: Path) -> dict[str, Any]:
+def _suite(_: str, file: Path) -> JsonObject:
     """Describe a suite by its title; its problems are built when a benchmark needs them."""
     import tomllib
 
@@ -160,7 +160,7 @@ def _summary(group: str, name: str) -> str:
         return f"(broken: {error})"
 
 
-def _section(what: str, entries: list[dict[str, Any]]) -> str:
+def _section(what: str, entries: list[JsonObject]) -> str:
     rows = [
         (entry["name"], *([entry["size"]] if "size" in entry else []), entry["title"])
         for entry in entries

@@ -17,8 +17,12 @@ from cnpgen.schema.toml import MARKS
 
 def add_options(parser: Parser) -> None:
     what = parser.add_mutually_exclusive_group(required=True)
-    text = "a shipped dataset, pipeline or problem (see 'cnpgen list'), or the file of a recipe or model"
-    what.add_argument("recipe", metavar="NAME|FILE", nargs="?", help=text)
+    what.add_argument(
+        "recipe",
+        metavar="NAME|FILE",
+        nargs="?",
+        help="a shipped dataset, pipeline or problem (see 'cnpgen list'), or the file of a recipe or model",
+    )
     what.add_argument(
         "--stage", metavar="KIND", help="describe a kind of stage and its keys"
     )
@@ -27,14 +31,14 @@ def add_options(parser: Parser) -> None:
         metavar="KIND",
         help="describe a kind of constraint and its keys",
     )
-    text = "all keys of problem, pipeline, dataset and suite files, in Markdown ('cnpgen docs keys'); WHAT is one kind"
     what.add_argument(
         "--keys",
         metavar="WHAT",
         nargs="?",
         choices=("all", *MARKS),
         const="all",
-        help=text,
+        help="all keys of problem, pipeline, dataset and suite files, in Markdown ('cnpgen docs keys'); "
+        "WHAT is one kind",
     )
     parser.add_argument(
         "--kind",

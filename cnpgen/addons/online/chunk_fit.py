@@ -86,7 +86,7 @@ class ChunkFit:
         # Every control point of the rate moves from the running to the final speed by
         # its share.
         u = running + (speed[:, None] - running) * self.ramp
-        return np.asarray(u / self.duration)
+        return u / self.duration
 
     def blended(self, q: Array, state: SetPoint, running: float) -> Array:
         """Add the difference to the running motion at the join to the samples, shape (K, n); it vanishes later.
@@ -96,7 +96,7 @@ class ChunkFit:
         # State of the chunk at its first sample, by a least-squares parabola.
         own = self.first @ q[: self.first.shape[1]]
         running_state = np.stack([state.q, state.dq / running, state.ddq / running**2])
-        return np.asarray(q + self.decay @ (running_state - own))
+        return q + self.decay @ (running_state - own)
 
     def fit(self, q: Array, state: SetPoint, rate: Array) -> tuple[Boundary, Array]:
         """Fit a path to samples, shape (K, n), that starts in a state and ends at rest.
@@ -183,7 +183,7 @@ def chunk_times(s: Array, duration: float) -> Array:
     """
     b = BRAKING_SHARE
     y = np.clip((s - 1 + b) / b, 0.0, 1.0)
-    return np.asarray(duration * (np.minimum(s, 1 - b) + b * (y - y**3 + y**4 / 2)))
+    return duration * (np.minimum(s, 1 - b) + b * (y - y**3 + y**4 / 2))
 
 
 def _decay(length: int, step: float) -> Array:
@@ -213,4 +213,4 @@ def _greville(points: int) -> Array:
 def _smooth_step(x: Array) -> Array:
     """Return 3 y^2 - 2 y^3 of values clipped to [0, 1]."""
     y = np.clip(x, 0.0, 1.0)
-    return np.asarray(y**2 * (3 - 2 * y))
+    return y**2 * (3 - 2 * y)

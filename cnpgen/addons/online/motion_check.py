@@ -12,10 +12,9 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from cnpgen.addons.online.set_points import SampledMotion, parts_of
-from cnpgen.arrays import Array
+from cnpgen.arrays import Array, Mask
 from cnpgen.judges.plans.measure import measure
 from cnpgen.plans.plans import Plans
 from cnpgen.problems.problem import Problem
@@ -76,7 +75,7 @@ class MotionChecker:
         with self._lock:
             _, world = self._open(part)
             world.set_path(q.T, dq.T, ddq.T, part.scene.poses[0], exact=False)
-            return np.asarray(world.torque.T)
+            return world.torque.T
 
     def _open(self, part: Plans) -> tuple[Problem, PathWorld]:
         """Return the problem of a plan and a world for it, which are kept."""
@@ -96,7 +95,7 @@ class MotionChecker:
 
 def passed_parts(
     motion: SampledMotion, times: Array
-) -> Iterator[tuple[Plans, NDArray[np.bool_], Array]]:
+) -> Iterator[tuple[Plans, Mask, Array]]:
     """Yield the parts of its plan that a motion passes at K times [s], in their order.
 
     With each, return the mask of these times, shape (K,), and the phases of the part
@@ -120,4 +119,4 @@ def _jerks(motion: SampledMotion, times: Array) -> Array:
     # Times are shifted inward at the ends, so that all of them are within the motion.
     low = np.clip(times - JERK_STEP_S, motion.start, motion.end_time - 3 * JERK_STEP_S)
     before, after = (motion.at(low + k * JERK_STEP_S).ddq for k in (0, 2))
-    return np.asarray((after - before).T / (2 * JERK_STEP_S))
+    return (after - before).T / (2 * JERK_STEP_S)

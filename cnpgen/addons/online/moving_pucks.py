@@ -23,7 +23,7 @@ from cnpgen.addons.online.hit_tasks import (
     lanes,
     state_lanes,
 )
-from cnpgen.arrays import Array
+from cnpgen.arrays import Array, Indices, Mask, Names
 from cnpgen.errors import UsageError
 from cnpgen.pipelines.completion import Completion
 from cnpgen.pipelines.stages.stage import TaskBatch
@@ -39,7 +39,7 @@ from cnpgen.schema.arguments import check_range, numbers
 from cnpgen.trajectory.spline import basis
 
 HitArguments = tuple[
-    State, ArrayLike, ArrayLike, ArrayLike, ArrayLike, ArrayLike | None
+    State, ArrayLike, ArrayLike | None, ArrayLike, ArrayLike, ArrayLike | None
 ]
 
 MAX_MEETING_TIME_S = 60.0
@@ -195,8 +195,8 @@ class PuckModel:
 class MovingHits:
     """Arguments of ``plan_hits`` for N moving pucks, checked and brought to one length.
 
-    They are state, puck, velocity, target, speed share and meeting time, None for the
-    earliest. ``distance`` is that of the centres at the goal, and ``overlap`` the path
+    They are state, puck, velocity, None at rest, target, speed share and meeting time,
+    None for the earliest. ``distance`` is that of the centres at the goal, and ``overlap`` the path
     of the mallet from the contact to the goal [m].
     """
 
@@ -214,7 +214,8 @@ class MovingHits:
         self.distance = distance
         self.overlap = overlap
         self.waits = meeting_time is not None
-        given = {"puck": puck, "puck_velocity": velocity, "target": target}
+        moves = np.zeros(2) if velocity is None else velocity
+        given = {"puck": puck, "puck_velocity": moves, "target": target}
         parts = {name: lanes(name, values, {2}).T for name, values in given.items()}
         time = 0.0 if meeting_time is None else meeting_time
         for name, values in {"speed_share": share, "meeting_time": time}.items():
@@ -236,16 +237,14 @@ class MovingHits:
         self.meeting_time = parts["meeting_time"][:, 0]
         self.state = tuple(parts[f"state {index}"] for index in range(3))
         if self.waits and (self.state[1].any() or self.state[2].any()):
-            raise UsageError(
-                "is not at rest: an arm that waits for the puck must be",
-                argument="state",
-            )
+            text = "is not at rest: an arm that waits for the puck must be"
+            raise UsageError(text, argument="state")
 
     def tasks_at(
         self,
         time: Array,
         speed: Array,
-        rows: NDArray[np.intp],
+        rows: Indices,
         completion: Completion,
     ) -> TaskBatch:
         """Complete the tasks of some hits that meet the pucks at these times [s] with these speeds [m/s]."""
@@ -263,11 +262,11 @@ class MovingHits:
             angle=angle,
         )
 
-    def touching_at_start(self, completion: Completion) -> NDArray[np.bool_]:
+    def touching_at_start(self, completion: Completion) -> Mask:
         """Return which pucks touch the mallet in the state of the arm, shape (N,)."""
         start = completion.tip_positions(self.state[0].T)[:2].T
         distance = np.linalg.norm(self.puck - start, axis=1)
-        touching: NDArray[np.bool_] = distance < self.distance + self.overlap
+        touching: Mask = distance < self.distance + self.overlap
         return touching
 
     def with_pucks(self, plans: Plans, delay: Array) -> Plans:
@@ -299,16 +298,46 @@ def _of_one_length(parts: Mapping[str, Array]) -> dict[str, Array]:
 
 def plan_moving_hits(
     planner: Planner, completion: Completion, hits: MovingHits
-) -> tuple[Plans, tuple[str, ...], Array]:
+) -> tuple[Plans, Names, Array]:
     """Plan hits of moving pucks; return plans, reasons of the others, and waiting times before the plans [s].
 
     The earliest meeting time is a fixed point: the time of the contact in the plan to
     the puck at this time. The iteration converges if the puck is slower than the
     mallet.
     """
+    reasons = np.full(len(hits.puck), "", object)
+    active, plans, contact, change = _planned(planner, completion, hits, reasons)
+    if hits.waits:
+        # The arm waits until the plan meets the puck at the stated time.
+        delay = hits.meeting_time[active] - contact
+        accepted = delay >= 0
+    else:
+        delay = np.zeros(len(active))
+        accepted = change <= MAX_MEETING_ERROR_S
+    reasons[active[~accepted]] = TOO_LATE if hits.waits else NO_MEETING
+    # Pucks must not touch the mallet before the meeting, nor at the start.
+    touched = _touched_early(completion, hits, plans, delay)
+    reasons[active[accepted & touched]] = PuckContact.reason
+    touching = hits.touching_at_start(completion)
+    reasons[touching] = PuckContact.boundary_reason
+    accepted &= ~touched & ~touching[active]
+    delay = delay[accepted]
+    return hits.with_pucks(plans[accepted], delay), tuple(reasons.tolist()), delay
+
+
+def _planned(
+    planner: Planner,
+    completion: Completion,
+    hits: MovingHits,
+    reasons: NDArray[np.object_],
+) -> tuple[Indices, Plans, Array, Array]:
+    """Iterate the meeting times, and write the reasons of hits without an answer.
+
+    Return the indices of the others, their plans, the times of their contacts, and the
+    last changes of the meeting times [s].
+    """
     time = hits.meeting_time.copy()
     speed = np.full(len(hits.puck), EXPECTED_HIT_SPEED_M_S)
-    reasons = np.full(len(hits.puck), "", object)
     active = np.arange(len(hits.puck))
     for iteration in range(MAX_MEETING_ITERATIONS):
         tasks = hits.tasks_at(time[active], speed[active], active, completion)
@@ -324,37 +353,19 @@ def plan_moving_hits(
         # The mallet covers the overlap after the contact, at about its final speed.
         contact = plans.duration - hits.overlap / speed[active]
         # Fixed point: the contact time of the plan is the next meeting time.
-        change = np.abs(contact - time[active])
         last = time[active]
-        if hits.waits or not len(active) or (change <= MAX_MEETING_ERROR_S).all():
+        change = np.abs(contact - last)
+        has_converged = change <= MAX_MEETING_ERROR_S
+        if hits.waits or has_converged.all():
             break
         # Hits that have converged keep their time, so that their plans stay.
-        time[active] = np.where(change <= MAX_MEETING_ERROR_S, last, contact)
-    if not hits.waits:
-        delay = np.zeros(len(active))
-        accepted = change <= MAX_MEETING_ERROR_S
-        reason = NO_MEETING
-    else:
-        # The arm waits until the plan meets the puck at the stated time.
-        delay = hits.meeting_time[active] - contact
-        reason = TOO_LATE
-        accepted = delay >= 0
-    reasons[active[~accepted]] = reason
-    touched = _touched_early(completion, hits, plans, delay)
-    reasons[active[accepted & touched]] = PuckContact.reason
-    touching = hits.touching_at_start(completion)
-    reasons[touching] = PuckContact.boundary_reason
-    accepted &= ~touched & ~touching[active]
-    return (
-        hits.with_pucks(plans[accepted], delay[accepted]),
-        tuple(reasons.tolist()),
-        delay[accepted],
-    )
+        time[active] = np.where(has_converged, last, contact)
+    return active, plans, contact, change
 
 
 def _touched_early(
     completion: Completion, hits: MovingHits, plans: Plans, delay: Array
-) -> NDArray[np.bool_]:
+) -> Mask:
     """Return whether moving pucks touch the mallet before the meeting, while it waits (if not negative) or moves."""
     if not len(plans):
         return np.zeros(0, bool)
@@ -387,9 +398,7 @@ def _touched_early(
     return touched
 
 
-def _touching(
-    hits: MovingHits, rows: NDArray[np.intp], mallet: Array, time: Array
-) -> NDArray[np.bool_]:
+def _touching(hits: MovingHits, rows: Indices, mallet: Array, time: Array) -> Mask:
     """Return whether pucks touch mallets at positions, shape (P, K, 2), between times, shape (P, K)."""
     puck, velocity = (
         np.repeat(values[rows], time.shape[1], axis=0)
@@ -401,9 +410,7 @@ def _touching(
         - mallet
     )
     distance = distances_from_segments(np.zeros(2), relative[:, :-1], relative[:, 1:])
-    touching: NDArray[np.bool_] = (
-        distance < hits.distance + hits.overlap - MAX_EARLY_DEPTH_M
-    )
+    touching: Mask = distance < hits.distance + hits.overlap - MAX_EARLY_DEPTH_M
     return touching
 
 

@@ -19,7 +19,6 @@ from functools import cache
 from itertools import product
 
 import numpy as np
-from numpy.typing import NDArray
 
 from cnpgen.addons.online.motion_check import MotionChecker, passed_parts
 from cnpgen.addons.online.set_points import (
@@ -29,7 +28,7 @@ from cnpgen.addons.online.set_points import (
     joined_motions,
     sample_states,
 )
-from cnpgen.arrays import Array
+from cnpgen.arrays import Array, Integers, Mask
 from cnpgen.plans.plans import Plans
 from cnpgen.problems.constraints.joint import JointAcceleration, JointTorque
 from cnpgen.problems.problem_record import open_problem
@@ -76,9 +75,7 @@ class PathLimits:
     brake_factor: Array
     limit: Array
 
-    def feasible(
-        self, start: Array, duration: Array, shapes: NDArray[np.int64]
-    ) -> NDArray[np.bool_]:
+    def feasible(self, start: Array, duration: Array, shapes: Integers) -> Mask:
         """Return which of N time laws are within the limits, shape (N,).
 
         Starts and durations [s] have shape (N,), shapes are indices of ``shape_table``.
@@ -88,7 +85,7 @@ class PathLimits:
         sigma = start[:, None] + duration[:, None] * travel
         return self.within(sigma, speed, brake / duration[:, None])
 
-    def within(self, sigma: Array, speed: Array, brake: Array) -> NDArray[np.bool_]:
+    def within(self, sigma: Array, speed: Array, brake: Array) -> Mask:
         """Return which of N time laws are within the limits at K places on the path sigma [s], shape (N,).
 
         The speed u and w [1/s] at these places have shape (N, K).

@@ -12,6 +12,7 @@ from cnpgen.addons.online.motion_check import MotionChecker
 from cnpgen.addons.online.plan_hits import PlannedHits
 from cnpgen.addons.online.set_points import (
     MAX_GRID_STEP_S,
+    PlanOrSequence,
     SampledMotion,
     SetPoint,
     sample_motion,
@@ -29,7 +30,7 @@ from cnpgen.problems.problem_record import ProblemRecord, open_problem
 from cnpgen.robots.robot import Robot
 from cnpgen.schema.arguments import numbers
 
-Executable = Plans | JoinedPlans | PlannedHits
+Executable = PlanOrSequence | PlannedHits
 
 # Of q [rad]; of dq and ddq as fractions of the limits.
 MAX_SWITCH_GAPS = (
@@ -72,7 +73,7 @@ class Admission:
         self._lock = threading.Lock()
 
     def refusal_or_motion(
-        self, plan: Plans | JoinedPlans, at: float
+        self, plan: PlanOrSequence, at: float
     ) -> tuple[SwitchOutcome | SampledMotion, str]:
         """Return the motion of a plan that starts at a time [s], or the reason to refuse it, each with a text.
 
@@ -84,7 +85,7 @@ class Admission:
         return self._find_reason(plan, end) or self._with_smooth_end(plan, end, at)
 
     def _with_smooth_end(
-        self, plan: Plans | JoinedPlans, end: SetPoint, at: float
+        self, plan: PlanOrSequence, end: SetPoint, at: float
     ) -> tuple[SwitchOutcome | SampledMotion, str]:
         """Return the motion of a plan, slower at its end if it would end with an acceleration, and a text about it."""
         motion = sample_motion(plan, at, step=self._step)
@@ -98,7 +99,7 @@ class Admission:
         added = slower.end_time - motion.end_time
         return slower, f"{text}, which falls to 0 in {added:.3g} s more"
 
-    def _check_plan(self, plan: Plans | JoinedPlans) -> None:
+    def _check_plan(self, plan: PlanOrSequence) -> None:
         """Raise an error for several plans and for plans of another robot."""
         if len(plan) != 1:
             raise UsageError(
@@ -112,7 +113,7 @@ class Admission:
             )
 
     def _find_reason(
-        self, plan: Plans | JoinedPlans, end: SetPoint
+        self, plan: PlanOrSequence, end: SetPoint
     ) -> tuple[SwitchOutcome, str] | None:
         """Return the reason why a plan must not be executed at any time.
 
@@ -172,7 +173,7 @@ class Admission:
         return ""
 
 
-def _end_of(plan: Plans | JoinedPlans) -> SetPoint:
+def _end_of(plan: PlanOrSequence) -> SetPoint:
     """Return the state at the end of one plan or sequence."""
     last = plan.parts[-1] if isinstance(plan, JoinedPlans) else plan
     # Phases of each motion: Horner's rule is faster here than the basis functions.
@@ -182,7 +183,7 @@ def _end_of(plan: Plans | JoinedPlans) -> SetPoint:
 
 def plan_of_request(
     plan: Executable | None,
-) -> tuple[Plans | JoinedPlans | None, str]:
+) -> tuple[PlanOrSequence | None, str]:
     """Return the plan or sequence of a request, or None and the reason why there is none."""
     if not isinstance(plan, PlannedHits):
         return (plan, "") if plan is None or len(plan) else (None, "it has 0 plans")

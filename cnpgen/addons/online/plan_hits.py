@@ -4,12 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import partial
 from typing import Any
 from weakref import WeakKeyDictionary
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from cnpgen.addons.online.hit_tasks import (
     State,
@@ -18,7 +17,7 @@ from cnpgen.addons.online.hit_tasks import (
     load_completion,
 )
 from cnpgen.addons.online.moving_pucks import MovingHits, PuckModel, plan_moving_hits
-from cnpgen.arrays import Array
+from cnpgen.arrays import Array, Mask, Names
 from cnpgen.errors import UsageError, counted
 from cnpgen.judges.plans.judge import Judge
 from cnpgen.machine.threads import one_thread
@@ -60,7 +59,7 @@ class PlannedHits:
     """
 
     plans: Plans
-    reasons: tuple[str, ...]
+    reasons: Names
     delay: Array
     overlap: float
     return_plans: Plans | None = None
@@ -174,81 +173,79 @@ def plan_hits(
     chosen = with_old_keywords(
         "plan_hits", options, HitOptions(), old_keywords, caller=CALLER + 1
     )
-    completion = _COMPLETIONS.get(planner)
-    if completion is None:
-        completion = _COMPLETIONS[planner] = load_completion(
-            planner.model, planner.backend
-        )
-    contact = as_problem(planner.model.problem).first(PuckContact)
-    distance = _contact_distance(contact, chosen.contact_distance)
-    overlap = 0.0 if contact is None else contact.overlap
-    if puck_velocity is None and meeting_time is None:
-        plan = partial(
-            _plan_resting,
-            planner,
-            (completion, state, puck, target),
-            lengths=(distance, overlap),
-            parameters=parameters,
-        )
-    else:
-        if parameters is not None:
-            raise UsageError("must be None for moving pucks", argument="parameters")
-        velocity = np.zeros(2) if puck_velocity is None else puck_velocity
-        plan = partial(
-            _plan_moving,
-            planner,
-            (completion, state, puck, velocity, target, meeting_time),
-            lengths=(distance, overlap),
+    completion = _completion_of(planner)
+    distance, overlap = _contact_lengths(planner, chosen.contact_distance)
+    is_moving = puck_velocity is not None or meeting_time is not None
+    if is_moving and parameters is not None:
+        raise UsageError("must be None for moving pucks", argument="parameters")
+
+    def hits_at(speed_share: ArrayLike) -> PlannedHits:
+        """Plan hits at shares of the highest speed."""
+        if not is_moving:
+            task = completion, state, puck, target
+            plans, reasons = _plan_resting(
+                planner, task, speed_share, distance, parameters
+            )
+            return PlannedHits(plans, reasons, np.zeros(len(plans)), overlap)
+        moving = MovingHits(
+            planner.robot.n,
+            (state, puck, puck_velocity, target, speed_share, meeting_time),
             model=chosen.puck_model or PuckModel(),
+            distance=distance,
+            overlap=overlap,
         )
-    if home is None:
-        return plan(1.0 if chosen.speed_share is None else chosen.speed_share)
+        return PlannedHits(*plan_moving_hits(planner, completion, moving), overlap)
 
-    def with_return(speed_share: ArrayLike) -> PlannedHits:
-        hits = plan(speed_share)
-        back = _plan_returns(planner, hits, numbers("home", home))
-        return replace(hits, return_plans=back)
+    return _with_returns(planner, hits_at, home, chosen.speed_share)
 
-    if chosen.speed_share is None:
-        return _first_valid(planner, with_return)
-    return with_return(chosen.speed_share)
+
+def _completion_of(planner: Planner) -> Completion:
+    """Return the pipeline stages of a planner's model, which are loaded once."""
+    found = _COMPLETIONS.get(planner)
+    if found is None:
+        found = load_completion(planner.model, planner.backend)
+        _COMPLETIONS[planner] = found
+    return found
 
 
 def _plan_resting(
     planner: Planner,
     task: tuple[Completion, State, ArrayLike, ArrayLike],
     speed_share: ArrayLike,
-    *,
-    lengths: tuple[float, float],
+    distance: float,
     parameters: ArrayLike | None,
-) -> PlannedHits:
-    """Plan hits of pucks at rest; the lengths are the contact distance and the overlap [m]."""
-    distance, overlap = lengths
+) -> tuple[Plans, Names]:
+    """Plan hits of pucks at rest at a contact distance [m]; return plans, and reasons of the others."""
     tasks = hit_tasks(
         *task, contact_distance=distance, share=speed_share, parameters=parameters
     )
     columns = {name: tasks[name][0] for name in CONTEXT}
     boundary = boundary_of_tasks(tasks, planner.model.fixed_at_goal)
-    plans = plan_tasks(planner, boundary, tasks.alive, columns)
-    return PlannedHits(plans, tasks.why(), np.zeros(len(plans)), overlap)
+    return plan_tasks(planner, boundary, tasks.alive, columns), tasks.why()
 
 
-def _plan_moving(
+def _with_returns(
     planner: Planner,
-    task: tuple[Completion, State, ArrayLike, ArrayLike, ArrayLike, ArrayLike | None],
-    speed_share: ArrayLike,
-    *,
-    lengths: tuple[float, float],
-    model: PuckModel,
+    hits_at: Callable[[ArrayLike], PlannedHits],
+    home: ArrayLike | None,
+    speed_share: ArrayLike | None,
 ) -> PlannedHits:
-    """Plan hits of moving pucks; the lengths are the contact distance and the overlap [m]."""
-    completion, state, puck, velocity, target, meeting_time = task
-    distance, overlap = lengths
-    arguments = state, puck, velocity, target, speed_share, meeting_time
-    moving = MovingHits(
-        planner.robot.n, arguments, model=model, distance=distance, overlap=overlap
-    )
-    return PlannedHits(*plan_moving_hits(planner, completion, moving), overlap)
+    """Plan hits at a share of the highest speed, 1 by default, and ways back to home if it is given.
+
+    With ways back, the default is the first share with which hit and way back are
+    valid.
+    """
+    if home is None:
+        return hits_at(1.0 if speed_share is None else speed_share)
+    rest = numbers("home", home)
+
+    def with_return(share: ArrayLike) -> PlannedHits:
+        hits = hits_at(share)
+        return replace(hits, return_plans=_plan_returns(planner, hits, rest))
+
+    if speed_share is None:
+        return _first_valid(planner, with_return)
+    return with_return(speed_share)
 
 
 def _first_valid(
@@ -271,7 +268,7 @@ def _first_valid(
     return hits
 
 
-def _valid(judge: Judge, plans: Plans | None) -> NDArray[np.bool_]:
+def _valid(judge: Judge, plans: Plans | None) -> Mask:
     """Return which plans are valid by the independent verdict, shape (M,)."""
     if plans is None or not len(plans):
         return np.zeros(0, bool)
@@ -300,17 +297,19 @@ def _plan_returns(planner: Planner, hits: PlannedHits, home: Array) -> Plans:
         return replace(back, sample_id=plans.sample_id)
 
 
-def _contact_distance(contact: PuckContact | None, given: float | None) -> float:
-    """Return the distance of the centres at the goal [m].
+def _contact_lengths(planner: Planner, given: float | None) -> tuple[float, float]:
+    """Return the distance of the centres at the goal, and the path of the mallet from the contact to the goal [m].
 
-    It must equal that of the constraint, if there is one.
+    The distance must equal that of the problem's constraint, if there is one.
     """
-    if given is None:
-        return CONTACT_DISTANCE_M if contact is None else contact.contact_distance
-    distance = number("contact_distance", given)
-    if contact is not None and distance != contact.contact_distance:
+    contact = as_problem(planner.model.problem).first(PuckContact)
+    if given is not None:
+        given = number("contact_distance", given)
+    if contact is None:
+        return CONTACT_DISTANCE_M if given is None else given, 0.0
+    if given not in {None, contact.contact_distance}:
         expected = f"{contact.contact_distance:g} m, as in the problem's constraint puck-contact"
         raise UsageError(
-            f"must be {expected}, got {distance:g} m", argument="contact_distance"
+            f"must be {expected}, got {given:g} m", argument="contact_distance"
         )
-    return distance
+    return contact.contact_distance, contact.overlap

@@ -18,6 +18,7 @@ from cnpgen.addons.online.replan_requests import ReplanRequests
 from cnpgen.addons.online.set_points import (
     GRID_STEPS_S,
     MAX_GRID_STEP_S,
+    PlanOrSequence,
     SampledMotion,
     SetPoint,
     at_rest,
@@ -28,10 +29,8 @@ from cnpgen.addons.online.timeline import Timeline
 from cnpgen.arrays import Array
 from cnpgen.errors import CnpgenError, UsageError
 from cnpgen.planner.planner import Planner
-from cnpgen.plans.join import JoinedPlans
-from cnpgen.plans.plans import Plans
 from cnpgen.problems.problem import Problem
-from cnpgen.problems.problem_record import as_record, open_problem
+from cnpgen.problems.problem_record import ProblemRecord, as_record, open_problem
 from cnpgen.schema.argument_types import checked_arguments
 from cnpgen.schema.arguments import (
     check_range,
@@ -103,10 +102,7 @@ class PlanRuntime:
         keep_stops: bool = True,
         grid_step: float = MAX_GRID_STEP_S,
     ) -> None:
-        with concerning("planner"):
-            record = as_record(
-                planner.model.problem if isinstance(planner, Planner) else planner
-            )
+        record = _record_of(planner)
         self._robot = robot = open_problem(record)[1]
         check_range("grid_step", number("grid_step", grid_step), *GRID_STEPS_S, "s")
         self._judge = judge
@@ -130,8 +126,7 @@ class PlanRuntime:
         self._kept_stops = KeptStops(self._checker, measured=judge)
         self._keeps_stops = keep_stops
         self._requests = ReplanRequests()
-        # Until the runtime is resumed.
-        self._stop: Stop | None = None
+        self._stop: Stop | None = None  # until the runtime is resumed
         self._stops = 0
         self._closed = False
 
@@ -210,7 +205,7 @@ class PlanRuntime:
             return self._timeline.state_at(times)
 
     @checked_arguments
-    def plan_at(self, time: float) -> tuple[Plans | JoinedPlans | None, float]:
+    def plan_at(self, time: float) -> tuple[PlanOrSequence | None, float]:
         """Return the plan whose path is followed at a time [s], and the time since its start at which it is there [s].
 
         They differ from those of the plan while the arm stops. At rest it is None.
@@ -386,6 +381,14 @@ class PlanRuntime:
         except (Exception, SystemExit) as error:  # noqa: BLE001 - errors of the caller's function are results
             kind = "" if isinstance(error, CnpgenError) else f"{type(error).__name__}: "
             return Switch(SwitchOutcome.FAILED, at, f"{kind}{error}")
+
+
+def _record_of(planner: object) -> ProblemRecord:
+    """Return the record of a planner's problem, or of a problem."""
+    with concerning("planner"):
+        return as_record(
+            planner.model.problem if isinstance(planner, Planner) else planner
+        )
 
 
 def _report(motion: SampledMotion, begin: float, detail: str = "") -> Stop:

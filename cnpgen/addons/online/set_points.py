@@ -13,6 +13,9 @@ from cnpgen.arrays import Array
 from cnpgen.plans.join import JoinedPlans
 from cnpgen.plans.plans import Plans
 
+PlanOrSequence = Plans | JoinedPlans
+"""One plan, or one sequence of plans, whose path a motion follows."""
+
 MAX_GRID_STEP_S = 1e-3
 GRID_STEPS_S = 1e-4, 4e-3  # that a caller may choose
 _QUINTIC = (
@@ -66,7 +69,7 @@ class SampledMotion:
     edges: Array
     coefficients: Array
     end: Array
-    plan: Plans | JoinedPlans | None
+    plan: PlanOrSequence | None
     plan_times: Array
 
     @property
@@ -106,7 +109,7 @@ class SampledMotion:
 
 
 def sample_motion(
-    plan: Plans | JoinedPlans, start: float, *, step: float = MAX_GRID_STEP_S
+    plan: PlanOrSequence, start: float, *, step: float = MAX_GRID_STEP_S
 ) -> SampledMotion:
     """Sample one plan, or one sequence of plans, that starts at a time [s], at most a step [s] apart."""
     edges = []
@@ -130,7 +133,7 @@ def sample_motion(
     )
 
 
-def parts_of(plan: Plans | JoinedPlans) -> list[tuple[Plans, float, float]]:
+def parts_of(plan: PlanOrSequence) -> list[tuple[Plans, float, float]]:
     """Return the parts of one plan or sequence, with their begins and ends since its start [s]."""
     if isinstance(plan, Plans):
         return [(plan, 0.0, float(plan.duration[0]))]
@@ -145,7 +148,7 @@ def grid(duration: float, step: float = MAX_GRID_STEP_S) -> Array:
 
 
 def sample_states(
-    times: Array, states: SetPoint, plan: Plans | JoinedPlans, plan_times: Array
+    times: Array, states: SetPoint, plan: PlanOrSequence, plan_times: Array
 ) -> SampledMotion:
     """Return the motion through states at times [s], shape (K,), which follows the path of a plan."""
     return SampledMotion(times, _cells(times, states), states.q[-1], plan, plan_times)

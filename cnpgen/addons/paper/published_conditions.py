@@ -21,15 +21,13 @@ from cnpgen.kernels.symbolic.obstacle_distances import (
 from cnpgen.kernels.symbolic.symbolic_state import SymbolicState
 from cnpgen.problems.constraints.axis import Vertical
 from cnpgen.problems.constraints.clearance import ObjectContact, RobotClearance
-from cnpgen.problems.constraints.constraint import Condition, Constraint
+from cnpgen.problems.constraints.constraint import Condition, Conditions, Constraint
 from cnpgen.robots.parameter_ranges import UPRIGHT_TOLERANCE
 
 MAX_POINT_SPACING_M = 0.1  # between points on the capsule axes of the robot
 
 
-def published_conditions(
-    constraint: Constraint, state: SymbolicState
-) -> tuple[Condition, ...]:
+def published_conditions(constraint: Constraint, state: SymbolicState) -> Conditions:
     """Return the conditions that the paper penalizes; for other constraints those of ``Constraint.penalized``.
 
     A sum inside one Huber loss of the paper is one value that must be 0.
@@ -70,7 +68,7 @@ def published_conditions(
     return constraint.penalized(state)
 
 
-def _zero(name: str, unit: str, value: Any) -> tuple[Condition, ...]:
+def _zero(name: str, unit: str, value: Any) -> Conditions:
     return (Condition(name, unit, [value], np.zeros(1), np.zeros(1), "position"),)
 
 

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
 
-from cnpgen.arrays import Array
+from cnpgen.arrays import Array, Vector3
 from cnpgen.errors import RecipeError
 from cnpgen.problems.constraints.constraint import Condition, LinkConstraint
 from cnpgen.problems.scenes.placement import moved_obstacle
@@ -88,12 +88,12 @@ class LinkOrientation(_LinkPoseConstraint):
     """
 
     reason = "link turned"
-    rpy: tuple[float, float, float] = field(
+    rpy: Vector3 = field(
         "wanted orientation in the world: roll, pitch, yaw, as in a URDF",
         unit="rad",
         plausible=2 * np.pi,
     )
-    limits: tuple[float, float, float] = field(
+    limits: Vector3 = field(
         "maximum angles about x, y and z; free from pi on",
         unit="rad",
         low=MIN_LIMIT_RAD,
@@ -210,7 +210,7 @@ class LinkPosition(_LinkPoseConstraint):
     """Constraint: a point of a link is in one of several regions, as ``moveit_msgs/PositionConstraint``."""
 
     reason = "link outside its region"
-    offset: tuple[float, float, float] = field(
+    offset: Vector3 = field(
         "point in the frame of the link", unit="m", default=(0.0, 0.0, 0.0)
     )
     region: tuple[Obstacle, ...] = field(
@@ -334,7 +334,7 @@ def _rotation_vector(D: Array) -> Array:
     from scipy.spatial.transform import Rotation
 
     vectors = Rotation.from_matrix(np.moveaxis(D, (0, 1), (-2, -1))).as_rotvec()
-    return np.asarray(np.moveaxis(vectors, -1, 0))
+    return np.moveaxis(vectors, -1, 0)
 
 
 def _angle_over_sine(cosine: Any) -> Any:

@@ -6,8 +6,9 @@ from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any
 
+from cnpgen.addons.scene_files.document_values import part, scalar
+from cnpgen.arrays import Names
 from cnpgen.problems.scenes.scene_problem import SceneError
-from cnpgen.problems.scenes.yaml_document import part, scalar
 from cnpgen.store.files.accounted import AccountedMapping
 
 MAX_SCALE = 10.0
@@ -35,7 +36,7 @@ class AllowedCollisions:
         ignored: Objects of the world that anything may touch.
     """
 
-    touching: Mapping[str, tuple[str, ...]]
+    touching: Mapping[str, Names]
     ignored: frozenset[str]
 
 

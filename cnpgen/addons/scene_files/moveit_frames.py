@@ -6,11 +6,11 @@ from typing import Any
 
 import numpy as np
 
+from cnpgen.addons.scene_files.document_values import part, vector
 from cnpgen.arrays import Array
 from cnpgen.problems.scenes.quaternions import quaternion_error, rotation_matrix
 from cnpgen.problems.scenes.scene_problem import SceneError
 from cnpgen.problems.scenes.scene_request import BASE_FRAMES
-from cnpgen.problems.scenes.yaml_document import part, vector
 from cnpgen.robots.shape.hull import MAX_COORDINATE_M
 from cnpgen.store.files.accounted import is_default, mark_read
 
@@ -70,13 +70,19 @@ def pose_of(pose: Any, where: str) -> Pose:
     """Return position and rotation of a pose."""
     if not isinstance(pose, dict):
         raise SceneError(f"{where}: a pose must be a mapping, got {pose!r:.60}")
-    position = vector(pose.get("position"), "xyz", f"{where}: position")
-    if not (np.abs(position) <= MAX_COORDINATE_M).all():
-        # Also false for nan.
-        raise SceneError(
-            f"{where}: position must be finite and at most {MAX_COORDINATE_M:g}, got {position.tolist()}"
-        )
+    position = _coordinates(pose, "position", where)
     return position, rotation_of(pose.get("orientation"), where)
+
+
+def _coordinates(entry: Any, key: str, where: str) -> Array:
+    """Return x, y and z of an entry [m]."""
+    found = vector(entry.get(key), "xyz", f"{where}: {key}")
+    # Also false for nan.
+    if not (np.abs(found) <= MAX_COORDINATE_M).all():
+        raise SceneError(
+            f"{where}: {key} must be finite and at most {MAX_COORDINATE_M:g}, got {found.tolist()}"
+        )
+    return found
 
 
 def optional_pose(entry: Any, key: str, where: str) -> Pose:
@@ -93,12 +99,8 @@ def transform_of(transform: Any, where: str) -> Pose:
     if is_default(transform):
         mark_read(transform)
         return IDENTITY
-    shift = vector(transform.get("translation"), "xyz", f"{where}: translation")
+    shift = _coordinates(transform, "translation", where)
     turn = rotation_of(transform.get("rotation"), f"{where}: rotation")
-    if not (np.abs(shift) <= MAX_COORDINATE_M).all():
-        raise SceneError(
-            f"{where}: translation must be finite and at most {MAX_COORDINATE_M:g}, got {shift.tolist()}"
-        )
     # Transforms that change nothing become the object IDENTITY, by which they are
     # recognized.
     same = not shift.any() and np.abs(turn - np.eye(3)).max() <= MAX_BASE_TILT

@@ -2,24 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
+from cnpgen.addons.scene_files.document_values import part, scalar, vector
 from cnpgen.addons.scene_files.euler_tolerance import rotation_vector_tolerance
-from cnpgen.addons.scene_files.link_constraints import EULER, REGIONS, ROTATION_VECTOR
+from cnpgen.addons.scene_files.link_constraints import EULER, ROTATION_VECTOR
 from cnpgen.addons.scene_files.moveit_frames import (
     FrameTable,
     frame_id,
-    pose_of,
     rotation_of,
 )
-from cnpgen.addons.scene_files.moveit_shapes import primitive_kind, primitive_sizes
-from cnpgen.arrays import Array
+from cnpgen.addons.scene_files.moveit_shapes import read_regions
+from cnpgen.arrays import Array, NamedNumbers, Names
 from cnpgen.problems.scenes.scene_problem import GoalPose, SceneError
-from cnpgen.problems.scenes.yaml_document import part, scalar, vector
 
 _PARAMETRIZATIONS = {"0": EULER, "XYZ_EULER_ANGLES": EULER}
 _PARAMETRIZATIONS |= {"1": ROTATION_VECTOR, "ROTATION_VECTOR": ROTATION_VECTOR}
@@ -35,8 +33,8 @@ class JointGoals:
 
 
 def read_start(
-    state: Any, where: str, present: Mapping[str, float]
-) -> tuple[tuple[str, ...], Array, Array | None]:
+    state: Any, where: str, present: NamedNumbers
+) -> tuple[Names, Array, Array | None]:
     """Return names, positions [rad] and velocities [rad/s] of the joints at the start.
 
     A state without joints is the present one, which the caller may know.
@@ -69,7 +67,7 @@ def read_start(
 
 
 def read_joint_goals(
-    goals: list[Any], joints: tuple[str, ...], start: Array, where: str
+    goals: list[Any], joints: Names, start: Array, where: str
 ) -> JointGoals:
     """Return the goal states of all alternatives with constraints of joints.
 
@@ -82,7 +80,7 @@ def read_joint_goals(
     return JointGoals(states, below, above)
 
 
-def _joint_goal(goal: Any, joints: tuple[str, ...], start: Array, where: str) -> Array:
+def _joint_goal(goal: Any, joints: Names, start: Array, where: str) -> Array:
     """Return joint positions of a goal and their tolerances below and above, shape (3, n)."""
     values = np.array([start, np.zeros_like(start), np.zeros_like(start)])
     constrained = set[str]()
@@ -165,28 +163,19 @@ def _region(constraint: Any, where: str) -> tuple[Array, float]:
         "target_point_offset",
         "the origin of the link must be the target: move the region instead",
     )
-    region = part(constraint, "constraint_region", dict, where)
-    if part(region, "meshes", list, where) or part(region, "mesh_poses", list, where):
-        raise SceneError(f"{where}: a goal region must be a primitive, got meshes")
-    primitives = part(region, "primitives", list, where)
-    poses = part(region, "primitive_poses", list, where)
-    if len(primitives) != 1 or len(poses) != 1:
+    shapes = read_regions(constraint, "a goal region", where)
+    if len(shapes) != 1:
         raise SceneError(
-            f"{where}: a position constraint must have one primitive with a pose, got {len(primitives)}"
+            f"{where}: a position constraint must have one primitive with a pose, got {len(shapes)}"
         )
-    kind = primitive_kind(primitives[0])
-    if kind not in REGIONS:
-        raise SceneError(
-            f"{where}: a goal region must be one of {', '.join(REGIONS)}, got {kind!r:.60}"
-        )
-    sizes = primitive_sizes(primitives[0], where)
+    sizes = shapes[0].sizes
     if not sizes.size or not (np.isfinite(sizes) & (sizes > 0)).all():
         raise SceneError(
             f"{where}: dimensions of the goal region must be positive, got {sizes.tolist()!r:.60}"
         )
     # the ball in a box has half of its minimum edge, that in a cylinder also at most its radius
-    radius = sizes[0] if kind == "sphere" else sizes.min() / 2
-    return pose_of(poses[0], where)[0], float(radius)
+    radius = sizes[0] if shapes[0].kind == "sphere" else sizes.min() / 2
+    return shapes[0].pose[0], float(radius)
 
 
 def orientation_of(constraint: Any, where: str) -> tuple[Array, Array, str]:

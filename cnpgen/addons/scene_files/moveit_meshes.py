@@ -9,9 +9,9 @@ from typing import Any
 
 import numpy as np
 
+from cnpgen.addons.scene_files.document_values import vector
 from cnpgen.errors import RecipeError
 from cnpgen.problems.scenes.scene_problem import SceneError
-from cnpgen.problems.scenes.yaml_document import vector
 from cnpgen.robots.shape.inline import corners_of, inline_mesh
 
 PACKAGE = "package://"

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from cnpgen.addons.scene_files.document_values import part, scalar
 from cnpgen.addons.scene_files.moveit_frames import (
     IDENTITY,
     FrameTable,
@@ -23,9 +24,9 @@ from cnpgen.addons.scene_files.moveit_shapes import (
     read_shapes,
     shape_poses,
 )
+from cnpgen.arrays import Names
 from cnpgen.problems.scenes.scene_problem import SceneError, check_count
 from cnpgen.problems.scenes.scene_request import AttachedObject
-from cnpgen.problems.scenes.yaml_document import part, scalar
 
 _LOG = logging.getLogger(__name__)
 OPERATIONS = ("ADD", "REMOVE", "APPEND", "MOVE")  # in the order of their codes
@@ -241,7 +242,7 @@ def read_attached(
 
 
 def with_touch_links(
-    attached: AttachedObject, touching: Mapping[str, tuple[str, ...]]
+    attached: AttachedObject, touching: Mapping[str, Names]
 ) -> AttachedObject:
     """Return an attached object with further links that may touch it, object -> links."""
     links = dict.fromkeys((*attached.touch_links, *touching.get(attached.name, ())))

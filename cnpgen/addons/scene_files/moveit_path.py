@@ -7,21 +7,21 @@ from typing import Any
 
 import numpy as np
 
+from cnpgen.addons.scene_files.document_values import part, vector
 from cnpgen.addons.scene_files.link_constraints import (
     MIN_LIMIT_RAD,
     MIN_REGION_M,
-    REGIONS,
     LinkOrientation,
     LinkPosition,
 )
-from cnpgen.addons.scene_files.moveit_frames import FrameTable, frame_id, pose_of
+from cnpgen.addons.scene_files.moveit_frames import IDENTITY, FrameTable, frame_id
 from cnpgen.addons.scene_files.moveit_goals import check_weight, orientation_of
-from cnpgen.addons.scene_files.moveit_shapes import primitive_kind, primitive_sizes
+from cnpgen.addons.scene_files.moveit_shapes import built, read_regions
+from cnpgen.arrays import Vector3
 from cnpgen.problems.constraints.constraint import LinkConstraint
 from cnpgen.problems.scenes.placement import moved_obstacle
-from cnpgen.problems.scenes.quaternions import quaternion_of, roll_pitch_yaw
-from cnpgen.problems.scenes.scene_problem import SceneError, make_obstacle
-from cnpgen.problems.scenes.yaml_document import part, vector
+from cnpgen.problems.scenes.quaternions import roll_pitch_yaw
+from cnpgen.problems.scenes.scene_problem import SceneError
 from cnpgen.robots.obstacle import Obstacle
 
 PATH = "path_constraints"
@@ -60,8 +60,7 @@ def read_path_constraints(
         frame, link = _frame_and_link(entry, where)
         check_weight(entry, where)
         frame, pose = table.resolve(frame, (np.zeros(3), np.eye(3)))
-        regions = _regions(part(entry, "constraint_region", dict, where), where)
-        placed = tuple(moved_obstacle(each, pose) for each in regions)
+        placed = tuple(moved_obstacle(each, pose) for each in _regions(entry, where))
         offset = _offset(entry, where)
         yield frame, LinkPosition(link=link, offset=offset, region=placed)
 
@@ -73,7 +72,7 @@ def _frame_and_link(entry: Any, where: str) -> tuple[str, str]:
     return frame_id(entry, where), link
 
 
-def _offset(entry: Any, where: str) -> tuple[float, float, float]:
+def _offset(entry: Any, where: str) -> Vector3:
     """Return the point of the link that a position constraint is about [m]."""
     value = entry.get("target_point_offset")
     x, y, z = (
@@ -86,35 +85,15 @@ def _offset(entry: Any, where: str) -> tuple[float, float, float]:
     return x, y, z
 
 
-def _regions(region: Any, where: str) -> list[Obstacle]:
-    """Return the primitives of a constraint region, one of which contains the point."""
-    if part(region, "meshes", list, where) or part(region, "mesh_poses", list, where):
-        raise SceneError(
-            f"{where}: a region must be of primitives, got meshes: give boxes"
-        )
-    primitives = part(region, "primitives", list, where)
-    poses = part(region, "primitive_poses", list, where)
-    if not primitives or len(primitives) != len(poses):
-        raise SceneError(
-            f"{where}: a region must have one pose for each of its primitives, got"
-            f" {len(primitives)} primitives and {len(poses)} poses"
-        )
-    regions = []
-    for primitive, pose in zip(primitives, poses, strict=True):
-        kind = primitive_kind(primitive)
-        if kind not in REGIONS:
-            raise SceneError(
-                f"{where}: a region must be one of {', '.join(REGIONS)}, got {kind!r:.60}"
-            )
-        sizes = primitive_sizes(primitive, where)
-        if not (sizes >= MIN_REGION_M).all():
+def _regions(constraint: Any, where: str) -> list[Obstacle]:
+    """Return the primitives of a constraint's region, one of which contains the point."""
+    shapes = read_regions(constraint, "a region", where)
+    if not shapes:
+        raise SceneError(f"{where}: a region must have at least one primitive")
+    for shape in shapes:
+        if not (shape.sizes >= MIN_REGION_M).all():
             raise SceneError(
                 f"{where}: dimensions of a region must be at least {MIN_REGION_M:g} m,"
-                f" got {sizes.tolist()!r:.60}"
+                f" got {shape.sizes.tolist()!r:.60}"
             )
-        position, rotation = pose_of(pose, where)
-        turn = quaternion_of(rotation)
-        regions.append(
-            make_obstacle("region", kind, sizes, position, turn, place=where)
-        )
-    return regions
+    return list(built("region", shapes, IDENTITY, where))

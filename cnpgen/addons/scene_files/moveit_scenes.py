@@ -9,13 +9,14 @@ fixed transform. Every element is read, refused by name, or one of ``moveit_unus
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from cnpgen.addons.scene_files.document_values import part, scalar
 from cnpgen.addons.scene_files.moveit_collisions import (
     OCTOMAP,
     is_true,
@@ -47,6 +48,7 @@ from cnpgen.addons.scene_files.moveit_path import read_path_constraints
 from cnpgen.addons.scene_files.moveit_shapes import built
 from cnpgen.addons.scene_files.moveit_unused import UNUSED_ELEMENTS
 from cnpgen.addons.scene_files.octomap import read_octomap
+from cnpgen.arrays import JsonMapping, NamedNumbers, Names
 from cnpgen.errors import listed, nearest
 from cnpgen.problems.scenes.scene_problem import (
     MAX_SCENE_OBSTACLES,
@@ -55,7 +57,6 @@ from cnpgen.problems.scenes.scene_problem import (
 )
 from cnpgen.problems.scenes.scene_reader import ReadingOptions
 from cnpgen.problems.scenes.scene_request import SceneRequest
-from cnpgen.problems.scenes.yaml_document import part, scalar
 from cnpgen.robots.obstacle import Obstacle
 from cnpgen.store.files.accounted import (
     MISSPELT,
@@ -104,7 +105,7 @@ def read_moveit(
         yield _read_pair(scene_path, path, documents, options)
 
 
-def _hint(document: Mapping[str, Any], *missing: str) -> str:
+def _hint(document: JsonMapping, *missing: str) -> str:
     """Return the keys of a document that are probably a missing one, misspelt."""
     hints = (nearest(key, missing, similarity=MISSPELT) for key in document)
     found = [f"{key}{hint}" for key, hint in zip(document, hints, strict=True) if hint]
@@ -157,7 +158,7 @@ def _problem(
     scene: AccountedMapping,
     path: Path,
     request: AccountedMapping,
-    present: Mapping[str, float],
+    present: NamedNumbers,
 ) -> SceneProblem:
     name = re.sub(r"^(scene|request)[_-]?", "", path.stem) or path.stem
     place = f"{scene_path}: scene {name!r}"
@@ -171,9 +172,39 @@ def _problem(
     table = FrameTable(place)
     add_fixed_frames(table, scene, place)
     add_base(table, state, where)
+    obstacles, demands = _world(scene, own, table, place, where)
+    problem = _with_goals(request, where, joints, start, table)
+    velocity_scale, acceleration_scale = _scales(request, where)
+    constraints = list(read_path_constraints(request, table, where))
+    return replace(
+        problem,
+        name=name,
+        obstacles=obstacles,
+        source=str(scene_path),
+        request=replace(
+            problem.request,
+            **demands,
+            start_dq=velocity,
+            velocity_scale=velocity_scale,
+            acceleration_scale=acceleration_scale,
+            fixed_frames=tuple(table.used.items()),
+            constraints=tuple(each for _, each in constraints),
+            constraint_frames=tuple(frame for frame, _ in constraints),
+        ),
+    )
+
+
+def _world(
+    scene: AccountedMapping,
+    states: list[Any],
+    table: FrameTable,
+    place: str,
+    where: str,
+) -> tuple[tuple[Obstacle, ...], dict[str, Any]]:
+    """Return the obstacles of a scene, and what a request states about them and the objects that states attach."""
     objects = read_world(scene, place)
     add_object_frames(table, objects)
-    carried = [each for one in own for each in read_attached(one, objects, where)]
+    carried = [each for one in states for each in read_attached(one, objects, where)]
     add_object_frames(table, {item.name: item for item, _ in carried})
     names = [each.name for _, each in carried]
     allowed = read_allowed_collisions(scene, objects, names, place)
@@ -187,29 +218,13 @@ def _problem(
         placed_attached(item, with_touch_links(each, allowed.touching), table, place)
         for item, each in carried
     )
-    problem = _with_goals(request, where, joints, start, table)
-    velocity_scale, acceleration_scale = _scales(request, where)
-    constraints = list(read_path_constraints(request, table, where))
-    return replace(
-        problem,
-        name=name,
-        obstacles=tuple(obstacle for *_, obstacle in obstacles),
-        source=str(scene_path),
-        request=replace(
-            problem.request,
-            robot_name=part(scene, "robot_model_name", str, place),
-            start_dq=velocity,
-            velocity_scale=velocity_scale,
-            acceleration_scale=acceleration_scale,
-            obstacle_frames=tuple(frame for _, frame, _ in obstacles),
-            obstacle_touch_links=touching if any(touching) else (),
-            fixed_frames=tuple(table.used.items()),
-            attached=attached,
-            link_sizes=read_link_sizes(scene, place),
-            constraints=tuple(each for _, each in constraints),
-            constraint_frames=tuple(frame for frame, _ in constraints),
-        ),
-    )
+    return tuple(obstacle for *_, obstacle in obstacles), {
+        "robot_name": part(scene, "robot_model_name", str, place),
+        "obstacle_frames": tuple(frame for _, frame, _ in obstacles),
+        "obstacle_touch_links": touching if any(touching) else (),
+        "attached": attached,
+        "link_sizes": read_link_sizes(scene, place),
+    }
 
 
 def _states(
@@ -262,7 +277,7 @@ def _scales(request: AccountedMapping, where: str) -> tuple[float, float]:
 def _with_goals(
     request: AccountedMapping,
     where: str,
-    joints: tuple[str, ...],
+    joints: Names,
     start: Any,
     table: FrameTable,
 ) -> SceneProblem:

@@ -8,11 +8,12 @@ from typing import Any
 
 import numpy as np
 
+from cnpgen.addons.scene_files.document_values import part, vector
+from cnpgen.addons.scene_files.link_constraints import REGIONS
 from cnpgen.addons.scene_files.moveit_frames import Pose, composed, pose_of
 from cnpgen.arrays import Array
 from cnpgen.problems.scenes.quaternions import quaternion_of
 from cnpgen.problems.scenes.scene_problem import SceneError, make_mesh, make_obstacle
-from cnpgen.problems.scenes.yaml_document import part, vector
 from cnpgen.robots.obstacle import Obstacle
 
 # Codes of shape_msgs/SolidPrimitive.
@@ -66,22 +67,22 @@ def read_shapes(entry: Any, where: str) -> list[ObjectShape]:
             raise SceneError(f"{where} has planes, {REMEDIES['planes']}")
     primitives = _with_poses(entry, "primitive", where)
     meshes = _with_poses(entry, "mesh", where)
-    shapes = [
-        _primitive(each, pose_of(pose, where), where) for each, pose in primitives
+    return [
+        *(_primitive(each, pose_of(pose, where), where) for each, pose in primitives),
+        *(
+            ObjectShape("mesh", _vertices(mesh, where), pose_of(pose, where))
+            for mesh, pose in meshes
+        ),
     ]
-    for mesh, pose in meshes:
-        shapes.append(ObjectShape("mesh", _vertices(mesh, where), pose_of(pose, where)))
-    return shapes
 
 
 def shape_poses(entry: Any, where: str) -> list[Pose]:
     """Return the poses of a message that moves the shapes of an object."""
-    entries = [
-        pose
+    return [
+        pose_of(pose, where)
         for key in ("primitive_poses", "mesh_poses")
         for pose in part(entry, key, list, where)
     ]
-    return [pose_of(pose, where) for pose in entries]
 
 
 def primitive_kind(primitive: Any) -> str:
@@ -99,6 +100,32 @@ def primitive_sizes(primitive: Any, where: str) -> Array:
     is_cylinder = primitive_kind(primitive) == "cylinder"
     # MoveIt: height and radius
     return sizes[::-1] if is_cylinder else sizes
+
+
+def read_regions(constraint: Any, noun: str, where: str) -> list[ObjectShape]:
+    """Return the primitives of a constraint's region with their poses."""
+    region = part(constraint, "constraint_region", dict, where)
+    if part(region, "meshes", list, where) or part(region, "mesh_poses", list, where):
+        raise SceneError(
+            f"{where}: {noun} must be of primitives, got meshes: give boxes"
+        )
+    primitives = part(region, "primitives", list, where)
+    poses = part(region, "primitive_poses", list, where)
+    if len(primitives) != len(poses):
+        raise SceneError(
+            f"{where}: {noun} must have one pose for each of its primitives, got"
+            f" {len(primitives)} primitives and {len(poses)} poses"
+        )
+    shapes = []
+    for primitive, pose in zip(primitives, poses, strict=True):
+        kind = primitive_kind(primitive)
+        if kind not in REGIONS:
+            raise SceneError(
+                f"{where}: {noun} must be one of {', '.join(REGIONS)}, got {kind!r:.60}"
+            )
+        sizes = primitive_sizes(primitive, where)
+        shapes.append(ObjectShape(kind, sizes, pose_of(pose, where)))
+    return shapes
 
 
 def _primitive(primitive: Any, pose: Pose, where: str) -> ObjectShape:

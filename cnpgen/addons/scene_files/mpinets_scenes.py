@@ -17,9 +17,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from cnpgen.arrays import Array
+from cnpgen.arrays import Array, Mask
 from cnpgen.problems.scenes.quaternions import quaternion_of
 from cnpgen.problems.scenes.scene_problem import (
     MAX_SCENES,
@@ -99,10 +98,7 @@ def _check_names(file: Hdf5, account: Account) -> None:
     trajectory = next((name for name in _TRAJECTORIES if name in file), "")
     used = [*ends] if ends else [trajectory]
     for sizes, _, word in _SHAPES.values():
-        quaternions = (
-            f"{word}_quats" if f"{word}_quats" in file else f"{word}_quaternions"
-        )
-        used += [*sizes, f"{word}_centers", quaternions]
+        used += [*sizes, f"{word}_centers", _quaternions(file, word)]
     names: dict[str, Any] = dict.fromkeys((*file.names(), *file.attributes))
     # Attributes of datasets, such as a unit or a scale, may change their numbers.
     names |= {
@@ -112,6 +108,11 @@ def _check_names(file: Hdf5, account: Account) -> None:
     for name in (*used, SCENE_NAMES):
         entries.get(name)
     account.finish(entries)
+
+
+def _quaternions(file: Hdf5, word: str) -> str:
+    """Return the name of the dataset of the rotations of a kind."""
+    return f"{word}_quats" if f"{word}_quats" in file else f"{word}_quaternions"
 
 
 def _ends(file: Hdf5, rows: slice) -> tuple[Array, Array]:
@@ -165,8 +166,7 @@ def _entries(file: Hdf5, kind: str, rows: slice, count: int) -> Array:
             np.broadcast_to([1.0, 0.0, 0.0, 0.0], (*columns[0].shape[:2], 4))
         )
     else:
-        name = f"{word}_quats" if f"{word}_quats" in file else f"{word}_quaternions"
-        columns.append(_column(file, name, 4, rows, count))
+        columns.append(_column(file, _quaternions(file, word), 4, rows, count))
     if len({column.shape[1] for column in columns}) > 1:
         counts = [column.shape[1] for column in columns]
         raise SceneError(
@@ -207,7 +207,7 @@ def _names(file: Hdf5, rows: slice, count: int) -> list[str]:
     return names
 
 
-def _is_present(kind: str, values: Array) -> NDArray[np.bool_]:
+def _is_present(kind: str, values: Array) -> Mask:
     """Return which entries are obstacles: those without a size of zero."""
     # Nan counts as a size.
     return np.asarray((values[:, : sum(_SHAPES[kind][1])] != 0).all(axis=1))

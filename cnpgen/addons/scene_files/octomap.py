@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from cnpgen.addons.scene_files.document_values import part, scalar, vector
 from cnpgen.addons.scene_files.moveit_collisions import is_true
 from cnpgen.addons.scene_files.moveit_frames import (
     FrameTable,
@@ -27,7 +28,6 @@ from cnpgen.arrays import Array
 from cnpgen.errors import UsageError
 from cnpgen.problems.scenes.placement import moved_obstacle
 from cnpgen.problems.scenes.scene_problem import MAX_SCENE_OBSTACLES, SceneError
-from cnpgen.problems.scenes.yaml_document import part, scalar, vector
 from cnpgen.robots.obstacle import Obstacle
 from cnpgen.schema.units import PLAUSIBLE_MAX
 from cnpgen.store.files.accounted import mark_read

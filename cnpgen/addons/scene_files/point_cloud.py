@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from cnpgen.arrays import Array
+from cnpgen.arrays import Array, Mask
 from cnpgen.errors import UsageError, counted
 from cnpgen.problems.scenes.scene_problem import MAX_SCENE_OBSTACLES
 from cnpgen.robots.obstacle import Obstacle
@@ -122,7 +122,7 @@ def _boxes(points: Array, edge: float) -> list[tuple[Array, Array]]:
     return list(zip(low, high, strict=True))
 
 
-def _grown(occupied: NDArray[np.bool_], voxel: Voxels) -> tuple[slice, ...]:
+def _grown(occupied: Mask, voxel: Voxels) -> tuple[slice, ...]:
     """Return the largest block of occupied voxels that begins at a voxel, grown along one axis after the other."""
     stop = voxel + 1
     # The longest axis of the grid first.

@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 
+from cnpgen.addons.scene_files.document_values import part, scalar, vector
 from cnpgen.problems.scenes.quaternions import quaternion_error, rotation_matrix
 from cnpgen.problems.scenes.scene_problem import (
     GoalPose,
@@ -24,7 +25,6 @@ from cnpgen.problems.scenes.scene_problem import (
     make_obstacle,
 )
 from cnpgen.problems.scenes.scene_request import BASE_FRAMES, SceneRequest
-from cnpgen.problems.scenes.yaml_document import part, scalar, vector
 from cnpgen.robots.obstacle import Obstacle
 from cnpgen.store.files.accounted import Account, UnusedElements, accounted
 

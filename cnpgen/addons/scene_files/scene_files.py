@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 import logging
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +20,7 @@ from cnpgen.addons.scene_files.robometrics_scenes import (
     is_robometrics,
     read_robometrics,
 )
+from cnpgen.arrays import AnyPath, JsonObject, NamedNumbers
 from cnpgen.errors import UsageError, listed
 from cnpgen.problems.scenes.scene_problem import (
     MAX_SCENES,
@@ -45,13 +46,13 @@ _LOG = logging.getLogger(__name__)
 
 @checked_arguments
 def load_scenes(
-    path: str | Path,
+    path: AnyPath,
     *,
     start: int = 0,
     n: int | None = None,
     allow_unused: Sequence[str] = (),
-    packages: Sequence[str | Path] = (),
-    present: Mapping[str, float] | None = None,
+    packages: Sequence[AnyPath] = (),
+    present: NamedNumbers | None = None,
     allowed_elsewhere: Sequence[str] = (),
 ) -> list[SceneProblem]:
     """Read the planning problems of scene files.
@@ -112,7 +113,7 @@ def load_scenes(
     return [checked_scene(scene) for scene in scenes]
 
 
-def _check_packages(packages: Sequence[str | Path]) -> None:
+def _check_packages(packages: Sequence[AnyPath]) -> None:
     """Check that packages are paths of folders."""
     is_list = not isinstance(packages, str | Path)
     if not is_list or not all(isinstance(each, str | Path) for each in packages):
@@ -126,7 +127,7 @@ def _check_packages(packages: Sequence[str | Path]) -> None:
 
 
 def _warn_of_unneeded_start(
-    scenes: Sequence[SceneProblem], present: Mapping[str, float]
+    scenes: Sequence[SceneProblem], present: NamedNumbers
 ) -> None:
     """Warn of a present state at which no scene starts."""
     names = tuple(present)
@@ -238,7 +239,7 @@ def _with_partner(file: Path, moveit: dict[Path, Any]) -> list[Any]:
     return read_yaml(file)
 
 
-def _add(moveit: dict[Path, Any], file: Path, document: dict[str, Any]) -> None:
+def _add(moveit: dict[Path, Any], file: Path, document: JsonObject) -> None:
     """Add a document of a file, which may have a scene and a request in two of them."""
     known = moveit.setdefault(file, {})
     if twice := sorted(known.keys() & document.keys()):
@@ -250,7 +251,7 @@ def _add(moveit: dict[Path, Any], file: Path, document: dict[str, Any]) -> None:
 
 @checked_arguments
 def save_scenes(
-    path: str | Path, scenes: Sequence[SceneProblem], *, joints: Sequence[str] = ()
+    path: AnyPath, scenes: Sequence[SceneProblem], *, joints: Sequence[str] = ()
 ) -> None:
     """Write scenes: one HDF5 file in the format of MPiNets, or a folder of planning scenes and requests of MoveIt.
 

@@ -9,11 +9,10 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cache
 from importlib.resources import files
-from typing import Any
 
 import numpy as np
 
-from cnpgen.arrays import Array
+from cnpgen.arrays import Array, JsonMapping, JsonObject, Names
 from cnpgen.errors import UsageError, either, nearest
 
 BY_POSITION = "slope", "offset", "lower_end", "upper_end"  # of velocity limits
@@ -56,7 +55,7 @@ class RecordedArm:
     """
 
     name: str
-    joints: tuple[str, ...]
+    joints: Names
     limits: Mapping[str, ArmLimit]
     noise: float | None
     noise_source: str
@@ -88,12 +87,12 @@ def known_arm(name: str) -> RecordedArm | None:
 
 
 @cache
-def _registry() -> dict[str, dict[str, Any]]:
+def _registry() -> dict[str, JsonObject]:
     text = files("cnpgen.addons.trajectories").joinpath("arms.toml").read_text("utf-8")
     return tomllib.loads(text)
 
 
-def _arm(name: str, data: Mapping[str, Any]) -> RecordedArm:
+def _arm(name: str, data: JsonMapping) -> RecordedArm:
     limits = {}
     for quantity in QUANTITIES:
         if quantity in data:

@@ -10,6 +10,7 @@ import numpy as np
 from cnpgen.addons.trajectories.load_options import LoadOptions
 from cnpgen.addons.trajectories.table_units import plain
 from cnpgen.addons.trajectories.trajectory_table import TrajectoryTable, Values
+from cnpgen.arrays import Names
 from cnpgen.errors import UsageError
 from cnpgen.plans.format import PHASE_COLUMN
 from cnpgen.plans.stated_units import UNIT_ATTRIBUTES
@@ -51,8 +52,11 @@ def read_hdf5_tables(path: Path, _: LoadOptions) -> Iterator[TrajectoryTable]:
         columns = file.columns(without=(JOINT_NAMES,))
         holders = [file.attributes, *(each.attributes for each in columns.values())]
         stated = [each.texts(JOINT_NAMES) for each in holders if JOINT_NAMES in each]
+        unused = [*(set(file.names()) - set(file))]
         if JOINT_NAMES in file.names():
             stated.append(file.texts(JOINT_NAMES))
+            of_names = file.attributes_of(JOINT_NAMES)
+            unused += [f"attribute {name} of {JOINT_NAMES}" for name in of_names]
         if len(set(stated)) > 1:
             raise UsageError(
                 f"{path}: {JOINT_NAMES} differ: {', '.join(stated[0])} and {', '.join(stated[-1])}"
@@ -60,7 +64,6 @@ def read_hdf5_tables(path: Path, _: LoadOptions) -> Iterator[TrajectoryTable]:
         names = stated[0] if stated else ()
         arrays = {name: column.read() for name, column in columns.items()}
         units = dict[str, str]()
-        unused = [*(set(file.names()) - set(file))]
         unused += [f"attribute {name}" for name in file.attributes]
         for name, column in columns.items():
             for attribute in column.attributes:
@@ -75,7 +78,7 @@ def read_hdf5_tables(path: Path, _: LoadOptions) -> Iterator[TrajectoryTable]:
 
 
 def _split(
-    path: Path, arrays: dict[str, Values], names: tuple[str, ...]
+    path: Path, arrays: dict[str, Values], names: Names
 ) -> Iterator[TrajectoryTable]:
     """Yield the trajectories of an archive: ``plan_00000_t`` and so on, or ``t`` and ``q`` of all."""
     parts: dict[str, dict[str, Values]] = {}

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from cnpgen.addons.trajectories.load_options import LoadOptions
-from cnpgen.addons.trajectories.message_tables import states_table, tables_of_document
+from cnpgen.addons.trajectories.message_tables import tables_of_document
 from cnpgen.addons.trajectories.trajectory_table import TrajectoryTable
 from cnpgen.errors import UsageError, either, listed, nearest, requires_extra
 
@@ -61,6 +61,30 @@ def read_bag(path: Path, options: LoadOptions) -> Iterator[TrajectoryTable]:
             them and ``options.topic`` names none.
         MissingExtraError: The package ``rosbags`` is not installed.
     """
+    topic, kind, messages, others = _read_topic(path, options.topic)
+    place = f"{path}: {topic}"
+    # A stream of states is one trajectory, another message is one or holds some.
+    parts = [(messages, place)]
+    if kind != STATES:
+        several = len(messages) > 1
+        parts = [
+            (message, f"{place}: [{index}]" if several else place)
+            for index, message in enumerate(messages)
+        ]
+    unused = tuple(f"topic {name}" for name in others)
+    tables = [
+        table
+        for document, where in parts
+        for table in tables_of_document(document, where, options.allow_unused)
+    ]
+    for table in tables:
+        yield replace(table, unused=(*table.unused, *unused))
+
+
+def _read_topic(
+    path: Path, stated: str | None
+) -> tuple[str, str, list[Any], list[str]]:
+    """Return a topic with trajectories, the type of its messages, these, and the names of the other topics."""
     with requires_extra("bags", "rosbags"):
         from rosbags.highlevel import AnyReader
         from rosbags.typesys import Stores, get_typestore
@@ -68,11 +92,9 @@ def read_bag(path: Path, options: LoadOptions) -> Iterator[TrajectoryTable]:
     store = get_typestore(Stores.ROS2_HUMBLE)
     try:
         with AnyReader([path], default_typestore=store) as bag:
-            topic = _topic(path, bag, options.topic)
+            topic, count = _topic(path, bag, stated)
             others = sorted({each.topic for each in bag.connections} - {topic})
             connections = [each for each in bag.connections if each.topic == topic]
-            stated = sum(each.msgcount for each in connections)
-            _check_count(path, topic, stated)
             messages = [
                 _plain(bag.deserialize(content, connection.msgtype))
                 for connection, _, content in bag.messages(connections)
@@ -84,29 +106,15 @@ def read_bag(path: Path, options: LoadOptions) -> Iterator[TrajectoryTable]:
         raise UsageError(
             f"{path} is not a bag, or is damaged: {error!r:.200}"
         ) from error
-    if len(messages) != stated:
+    if len(messages) != count:
         raise UsageError(
-            f"{path} states {stated:,} messages of {topic}, and holds {len(messages):,}"
+            f"{path} states {count:,} messages of {topic}, and holds {len(messages):,}"
         )
-    place = f"{path}: {topic}"
-    if _kind(connections[0]) == STATES:
-        tables = [states_table(messages, place, options.allow_unused)]
-    else:
-        tables = [
-            table
-            for index, message in enumerate(messages)
-            for table in tables_of_document(
-                message,
-                f"{place}: [{index}]" if len(messages) > 1 else place,
-                options.allow_unused,
-            )
-        ]
-    for table in tables:
-        yield replace(table, unused=(*table.unused, *map("topic {}".format, others)))
+    return topic, _kind(connections[0]), messages, others
 
 
-def _topic(path: Path, bag: Any, stated: str | None) -> str:
-    """Return the stated topic, or the only one with trajectories."""
+def _topic(path: Path, bag: Any, stated: str | None) -> tuple[str, int]:
+    """Return the stated topic, or the only one with trajectories, and its number of messages."""
     known = {
         each.topic: _kind(each)
         for each in bag.connections
@@ -130,14 +138,13 @@ def _topic(path: Path, bag: Any, stated: str | None) -> str:
             f"{path} has several topics with trajectories, {listed(texts, MAX_TOPICS)}: {{topic}} names one",
             remedies={"topic": min(known)},
         )
-    return stated or next(iter(known))
-
-
-def _check_count(path: Path, topic: str, count: int) -> None:
+    topic = stated or next(iter(known))
+    count = sum(each.msgcount for each in bag.connections if each.topic == topic)
     if count > MAX_MESSAGES:
         raise UsageError(
             f"{path}: {topic} has {count:,} messages, expected at most {MAX_MESSAGES:,}"
         )
+    return topic, count
 
 
 def _kind(connection: Any) -> str:

@@ -10,11 +10,12 @@ import argparse
 import json
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
+from cnpgen.arrays import Names
 from cnpgen.cli import values
 from cnpgen.cli.parser import Parser, refuse
-from cnpgen.errors import UsageError, listed
+from cnpgen.errors import UsageError, counted, listed
 
 if TYPE_CHECKING:
     from cnpgen.addons.trajectories.arm_registry import RecordedArm
@@ -102,7 +103,7 @@ def _arm(arguments: argparse.Namespace, recording: "Recording") -> "RecordedArm 
     return arm
 
 
-def _numbers(texts: tuple[str, ...] | None) -> list[int] | None:
+def _numbers(texts: Names | None) -> list[int] | None:
     """Return the numbers of episodes."""
     if texts is None:
         return None
@@ -138,7 +139,7 @@ def _scale(
 
 
 def _columns(
-    names: tuple[str, ...] | None, arm: "RecordedArm", episode: "Episode"
+    names: Names | None, arm: "RecordedArm", episode: "Episode"
 ) -> tuple[int, ...]:
     """Return the column of each joint of an arm."""
     from cnpgen.addons.trajectories.episode_files import joint_name
@@ -201,10 +202,19 @@ def _calibrated(path: Path, arm: "RecordedArm") -> list[float]:
     return factors
 
 
-def _kept(reports: "list[EpisodeReport]") -> list[str]:
+def _by_level(reports: "list[EpisodeReport]") -> dict[str, list[str]]:
+    """Return the names of the episodes of every level."""
     from cnpgen.addons.trajectories.episode_checks import Level
 
-    return [report.name for report in reports if report.level != Level.EXCLUDE]
+    return {
+        str(level): [report.name for report in reports if report.level == level]
+        for level in Level
+    }
+
+
+def _kept(reports: "list[EpisodeReport]") -> list[str]:
+    """Return the names of the episodes that are not excluded."""
+    return [report.name for report in reports if str(report.level) != "EXCLUDE"]
 
 
 def _lines(
@@ -214,18 +224,14 @@ def _lines(
     reports: "list[EpisodeReport]",
 ) -> list[str]:
     """Return one line for each episode, the summary, and what to do next."""
-    from cnpgen.addons.trajectories.episode_checks import Level
-
     lines = []
     for report in reports:
         first = f"  {report.findings[0]}" if report.findings else ""
         more = f"; {len(report.findings) - 1} more" if len(report.findings) > 1 else ""
         lines.append(f"{report.name:>8}  {report.level:<7}{first}{more}")
-    counts = ", ".join(
-        f"{sum(report.level == level for report in reports):,} {level}"
-        for level in Level
-    )
-    lines += ["", f"{path}: {len(reports):,} episodes: {counts}"]
+    names = _by_level(reports)
+    counts = ", ".join(f"{len(found):,} {level}" for level, found in names.items())
+    lines += ["", f"{path}: {counted(len(reports), 'episode')}: {counts}"]
     if arm is not None:
         for quantity, limit in arm.limits.items():
             lines.append(
@@ -235,14 +241,11 @@ def _lines(
         name: text for report in reports for name, text in report.not_run.items()
     }
     lines += [f"  not checked: {name}: {text}" for name, text in reasons.items()]
-    excluded = [report.name for report in reports if report.level == Level.EXCLUDE]
-    if excluded and recording.kind == "lerobot":
-        kept = ", ".join(_kept(reports))
-        gone = ", ".join(excluded)
+    if (excluded := names["EXCLUDE"]) and recording.kind == "lerobot":
         lines += [
-            f"  train without them: --dataset.episodes='[{kept}]'",
+            f"  train without them: --dataset.episodes='[{', '.join(_kept(reports))}]'",
             f"  delete them: lerobot-edit-dataset --repo_id {path} --operation.type delete_episodes"
-            f" --operation.episode_indices '[{gone}]'",
+            f" --operation.episode_indices '[{', '.join(excluded)}]'",
         ]
     return lines
 
@@ -251,24 +254,16 @@ def _write_json(
     path: str, arm: "RecordedArm | None", reports: "list[EpisodeReport]"
 ) -> None:
     """Write the reports as JSON."""
-    from cnpgen.addons.trajectories.episode_checks import Level
-
-    limits: dict[str, Any] = {}
-    if arm is not None:
-        limits = {
-            quantity: {"basis": limit.basis, "source": limit.source}
-            for quantity, limit in arm.limits.items()
-        }
     document = {
         "format": FORMAT,
         "format_version": EPISODE_CHECK_VERSION,
         "path": path,
         "arm": None if arm is None else arm.name,
-        "limits": limits,
-        "counts": {
-            str(level): sum(report.level == level for report in reports)
-            for level in Level
+        "limits": {
+            quantity: {"basis": limit.basis, "source": limit.source}
+            for quantity, limit in ({} if arm is None else arm.limits).items()
         },
+        "counts": {level: len(names) for level, names in _by_level(reports).items()},
         "kept": _kept(reports),
         "episodes": [report.to_dict() for report in reports],
     }

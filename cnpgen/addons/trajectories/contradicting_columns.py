@@ -11,7 +11,7 @@ import numpy as np
 
 from cnpgen.addons.trajectories.sample_errors import SampleErrors
 from cnpgen.addons.trajectories.sampled_trajectory import Trajectory
-from cnpgen.arrays import Array
+from cnpgen.arrays import Array, Names
 
 CONTRADICTION = "velocities are not the derivative of the positions"
 EXPLAINED_SHARE = 0.3  # of the difference, that may remain after a correction
@@ -24,7 +24,7 @@ def explain_velocities(
     trajectory: Trajectory,
     errors: SampleErrors,
     joint: int,
-    joint_names: tuple[str, ...],
+    joint_names: Names,
 ) -> str:
     """Return the error of recording that explains the velocities of a joint; empty if none does."""
     assert trajectory.dq is not None
@@ -47,7 +47,7 @@ def explain_velocities(
 
 
 def _explanations(
-    dq: Array, mean: Array, joint: int, joint_names: tuple[str, ...]
+    dq: Array, mean: Array, joint: int, joint_names: Names
 ) -> Iterator[tuple[str, Array, slice]]:
     """Yield explanations, the velocities that each corrects, and the spans that these cover."""
     # Shifted velocities lack one span at an end of the motion; other explanations cover
@@ -75,7 +75,7 @@ def _explanations(
 
 def _mean_of_neighbors(values: Array) -> Array:
     """Return the means of neighbors."""
-    return np.asarray((values[1:] + values[:-1]) / 2)
+    return (values[1:] + values[:-1]) / 2
 
 
 def _rms(values: Array) -> float:

@@ -5,14 +5,14 @@ family differs from it by at most a bound that is constant on each span. A famil
 zero bounds is one known curve.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from math import comb
 
 import numpy as np
-from numpy.typing import NDArray
 
-from cnpgen.arrays import Array
+from cnpgen.arrays import Array, Indices
 from cnpgen.judges.plans.bernstein import PiecewisePolynomials
 from cnpgen.judges.plans.evaluated_trajectory import EvaluatedTrajectory
 
@@ -33,7 +33,7 @@ class CurveFamily:
     # Bernstein coefficients of the nominal positions [rad], shape (d + 1, S, n).
     coefficients: Array
     # Largest differences of q, dq, ddq and jerk, shape (S, n) each.
-    bounds: tuple[Array, Array, Array, Array]
+    bounds: Sequence[Array]
     # Whether the nominal jerks are those of the polynomials; otherwise they are 0.
     has_jerk: bool = True
 
@@ -93,7 +93,7 @@ class CurveFamily:
             (np.abs(self.coefficients).max(axis=0) + self.bounds[0]).max(axis=0)
         )
 
-    def _spans(self, s: Array) -> tuple[NDArray[np.intp], Array]:
+    def _spans(self, s: Array) -> tuple[Indices, Array]:
         """Return the span of every phase and the position in it, from 0 to 1."""
         span = np.clip(np.searchsorted(self.edges, s, "right") - 1, 0, len(self.t) - 2)
         low = self.edges[span]
@@ -105,19 +105,21 @@ def _derivative(coefficients: Array, lengths: Array) -> Array:
     if len(coefficients) == 1:
         return np.zeros_like(coefficients)
     # Coefficients of the derivative: d (b_k+1 - b_k) / h, with the degree d.
-    return np.asarray(
-        (len(coefficients) - 1) * np.diff(coefficients, axis=0) / lengths[:, None]
+    return (len(coefficients) - 1) * np.diff(coefficients, axis=0) / lengths[:, None]
+
+
+def bernstein_basis(degree: int, u: Array) -> Array:
+    """Evaluate the Bernstein polynomials of a degree at phases u in [0, 1], shape (degree + 1, K)."""
+    # B_k(u) = C(d, k) u^k (1 - u)^(d - k).
+    return np.stack(
+        [comb(degree, k) * u**k * (1 - u) ** (degree - k) for k in range(degree + 1)]
     )
 
 
-def _values(coefficients: Array, span: NDArray[np.intp], u: Array) -> Array:
+def _values(coefficients: Array, span: Indices, u: Array) -> Array:
     """Evaluate polynomials in their spans, shape (n, K)."""
-    degree = len(coefficients) - 1
-    # B_k(u) = C(d, k) u^k (1 - u)^(d - k).
-    basis = [
-        comb(degree, k) * u**k * (1 - u) ** (degree - k) for k in range(degree + 1)
-    ]
     total = np.zeros((len(span), coefficients.shape[2]))
+    basis = bernstein_basis(len(coefficients) - 1, u)
     for weight, row in zip(basis, coefficients, strict=True):
         total += weight[:, None] * row[span]
     return np.ascontiguousarray(total.T)

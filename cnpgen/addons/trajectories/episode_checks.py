@@ -11,7 +11,6 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 from enum import StrEnum
 from itertools import islice
-from typing import Any
 
 import numpy as np
 
@@ -32,7 +31,8 @@ from cnpgen.addons.trajectories.lower_bounds import (
 )
 from cnpgen.addons.trajectories.sample_errors import rounding, time_rounding
 from cnpgen.addons.trajectories.velocity_by_position import span_limits
-from cnpgen.arrays import Array
+from cnpgen.arrays import Array, JsonObject
+from cnpgen.errors import counted
 
 NOMINAL_LAGS = (
     2  # distances in frames: a recorder that falls behind distorts longer ones
@@ -92,7 +92,7 @@ class EpisodeReport:
         """The most serious level; PASS without findings."""
         return self.findings[0].level if self.findings else Level.PASS
 
-    def to_dict(self) -> dict[str, Any]:
+    def to_dict(self) -> JsonObject:
         """Return the report for JSON."""
         return {
             "episode": self.name,
@@ -166,7 +166,9 @@ def _file_findings(episode: Episode) -> Iterator[EpisodeFinding]:
         if len(bad):
             frame, column = bad[0].tolist()
             joint = episode.names[column] if name == "state" else name
-            text = f"{len(bad)} values are no numbers, the first in frame {frame}"
+            text = (
+                f"{counted(len(bad), 'value')} not finite, the first in frame {frame}"
+            )
             yield EpisodeFinding(Level.EXCLUDE, "numbers", joint, None, text)
             return
     steps = np.diff(episode.t)

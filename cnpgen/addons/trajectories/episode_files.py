@@ -7,22 +7,26 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from cnpgen.addons.trajectories.lerobot_tables import LEROBOT_INFO, feature_names
+from cnpgen.addons.trajectories.lerobot_tables import (
+    LEROBOT_ACTION,
+    LEROBOT_INFO,
+    LEROBOT_STATE,
+    described,
+    episodes_of,
+    feature_names,
+    read_description,
+)
 from cnpgen.addons.trajectories.parquet_tables import read_parquet
 from cnpgen.addons.trajectories.table_units import plain, stated_factor
 from cnpgen.addons.trajectories.trajectory_tables import read_trajectory_tables
-from cnpgen.arrays import Array
-from cnpgen.errors import DatasetError, UsageError, listed
-from cnpgen.store.files.atomic import read_file
+from cnpgen.arrays import Array, Integers, Names
+from cnpgen.errors import DatasetError, UsageError, counted, listed
 from cnpgen.store.files.documents import parse_json
 from cnpgen.store.files.hdf5 import open_nested_hdf5
 from cnpgen.store.files.kind import HDF5_SUFFIXES
-from cnpgen.store.files.size_limits import MAX_TABLE_BYTES
 
-STATE = "observation.state"
-ACTION = "action"
+MEASURED = "measured states"  # in messages
 ROBOMIMIC_KEY = "obs/robot0_joint_pos"
 NOMINAL_TOLERANCE = 1e-3  # of a period, of times that are a grid
 TIME_COLUMNS = ("t", "time", "timestamp", "time_from_start")
@@ -49,8 +53,8 @@ class Episode:
     t: Array
     state: Array
     action: Array | None
-    names: tuple[str, ...]
-    frame: NDArray[np.int64]
+    names: Names
+    frame: Integers
     length: int | None = None
     has_units: bool = False
 
@@ -109,50 +113,30 @@ def read_recording(
 
 def _read_lerobot(folder: Path) -> Recording:
     """Read a dataset of LeRobot v3."""
-    try:
-        content = read_file(folder / LEROBOT_INFO, max_bytes=MAX_TABLE_BYTES)
-        info = parse_json(content.decode())
-        version = str(info["codebase_version"])
-        features = info["features"]
-        names = tuple(feature_names(features[STATE], "{}"))
-        width = len(feature_names(features.get(ACTION, {"shape": [len(names)]})))
-        robot = str(info.get("robot_type") or "")
-    except (ValueError, KeyError, TypeError, IndexError) as error:
-        text = (
-            f"{folder / LEROBOT_INFO} does not describe measured states: {error!r:.200}"
-        )
-        raise UsageError(text, concerns="path") from error
-    if not version.startswith("v3"):
-        text = f"{folder} has LeRobot's format {version}, expected v3.0"
-        raise UsageError(text, concerns="path")
+    info = read_description(folder, MEASURED)
+    features = info["features"]
+    with described(folder, MEASURED):
+        names = tuple(feature_names(features[LEROBOT_STATE], "{}"))
+        widths = {"timestamp": 1, "episode_index": 1, "frame_index": 1}
+        widths[LEROBOT_STATE] = len(names)
+        if LEROBOT_ACTION in features:
+            widths[LEROBOT_ACTION] = len(feature_names(features[LEROBOT_ACTION]))
     lengths = _stated_lengths(folder)
-    episodes = []
-    for file in sorted(folder.glob("data/*/*.parquet")):
-        table = read_parquet(file)
-        _check_columns(table, file)
-        number = _column(table, "episode_index", file, 1)[:, 0]
-        t = _column(table, "timestamp", file, 1)[:, 0]
-        frame = _column(table, "frame_index", file, 1)[:, 0].astype(np.int64)
-        state = _column(table, STATE, file, len(names))
-        action = None
-        if ACTION in table.column_names:
-            action = _column(table, ACTION, file, width)
-        for index in dict.fromkeys(number.tolist()):
-            rows = number == index
-            part = None if action is None else action[rows]
-            length = lengths.get(int(index))
-            columns = t[rows], state[rows], part, names, frame[rows], length
-            episodes.append(Episode(f"{index:g}", *columns))
+    episodes = [
+        Episode(
+            f"{index:g}",
+            columns["timestamp"][:, 0],
+            columns[LEROBOT_STATE],
+            columns.get(LEROBOT_ACTION),
+            names,
+            columns["frame_index"][:, 0].astype(np.int64),
+            lengths.get(int(index)),
+        )
+        for _, index, columns in episodes_of(folder, widths)
+    ]
     if not episodes:
         raise UsageError(f"{folder} holds no episodes", concerns="path")
-    return Recording(tuple(episodes), robot, "lerobot")
-
-
-def _check_columns(table: Any, file: Path) -> None:
-    """Check that a file has the columns of episodes."""
-    for name in ("timestamp", "episode_index", "frame_index", STATE):
-        if name not in table.column_names:
-            raise UsageError(f"{file}: there is no column {name!r}", concerns="path")
+    return Recording(tuple(episodes), str(info.get("robot_type") or ""), "lerobot")
 
 
 def _stated_lengths(folder: Path) -> dict[int, int]:
@@ -166,16 +150,6 @@ def _stated_lengths(folder: Path) -> dict[int, int]:
             )
             found |= dict(zip(*columns, strict=True))
     return found
-
-
-def _column(table: Any, name: str, file: Path, width: int) -> Array:
-    """Return a column of numbers, shape (rows, width)."""
-    try:
-        values = np.array(table.column(name).to_pylist(), float)
-        return values.reshape(table.num_rows, width)
-    except (TypeError, ValueError) as error:
-        text = f"{file}: column {name!r}: expected {width} numbers per row"
-        raise UsageError(text, concerns="path") from error
 
 
 def _read_hdf5(path: Path, key: str | None, rate: float | None) -> Recording:
@@ -283,6 +257,6 @@ def chosen(recording: Recording, episodes: Sequence[int] | None) -> tuple[Episod
     found = [by_name.get(str(k)) or numbered.get(k) for k in episodes]
     missing = [k for k, episode in zip(episodes, found, strict=True) if episode is None]
     if missing:
-        text = f"there is no episode {missing[0]}: {len(recording.episodes)} are numbered from 0"
+        text = f"there is no episode {missing[0]}: {counted(len(recording.episodes), 'episode')}, numbered from 0"
         raise UsageError(text, concerns="episodes")
     return tuple(episode for episode in found if episode is not None)

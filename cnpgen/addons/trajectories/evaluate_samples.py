@@ -21,13 +21,16 @@ from cnpgen.addons.trajectories.trajectory_options import (
     summary_text,
     write_json,
 )
+from cnpgen.arrays import Names
 from cnpgen.cli import values
+from cnpgen.cli.evaluate_command import refuse_without_effect
 from cnpgen.cli.parser import Options, refuse
 from cnpgen.cli.terminal import Meter
-from cnpgen.errors import UsageError
+from cnpgen.errors import UsageError, counted
 
 if TYPE_CHECKING:
     from cnpgen.addons.trajectories.evaluate_trajectories import TrajectoryEvaluation
+    from cnpgen.addons.trajectories.load_trajectories import LoadedTrajectories
 
 
 def add_options(options: Options) -> None:
@@ -69,14 +72,11 @@ def accepts(arguments: argparse.Namespace) -> bool:
 
 def run(arguments: argparse.Namespace) -> int:
     """Judge sampled trajectories."""
-    from cnpgen.addons.trajectories.evaluate_trajectories import evaluate_trajectories
-
     if arguments.tracking_error is not None:
         raise UsageError(
             "--tracking-error is for plans: --noise gives the error of sampled trajectories"
         )
-    if not arguments.plot:
-        refuse(arguments, ["plan"], "{} needs --plot")
+    refuse_without_effect(arguments)
     if arguments.ignore_velocities:
         refuse(arguments, ["velocities"], "{} has no effect with --ignore-velocities")
     problem = problem_of(arguments)
@@ -84,24 +84,9 @@ def run(arguments: argparse.Namespace) -> int:
     count = len(loaded.trajectories)
     if arguments.plan is not None and arguments.plan >= count:
         raise UsageError(
-            f"{arguments.file} has no trajectory {arguments.plan}: {count} are numbered from 0"
+            f"{arguments.file} has no trajectory {arguments.plan}: {counted(count, 'trajectory')}, numbered from 0"
         )
-    with Meter(
-        quiet=arguments.quiet or not sys.stderr.isatty(), noun="trajectory"
-    ) as meter:
-        meter.begin(f"judging {arguments.file}", count)
-        found = evaluate_trajectories(
-            loaded.problem,
-            loaded.trajectories,
-            interpolation=arguments.interpolation,
-            noise=arguments.noise,
-            time_jitter=arguments.time_jitter,
-            ignore_velocities=bool(arguments.ignore_velocities),
-            max_jerk=arguments.max_jerk,
-            step=arguments.step,
-            workers=arguments.workers or 1,
-            progress=meter,
-        )
+    found = _judged(arguments, loaded)
     if arguments.json:
         write_json(arguments.file, loaded, found)
     else:
@@ -113,11 +98,34 @@ def run(arguments: argparse.Namespace) -> int:
     return 0 if found.valid.all() else 1
 
 
+def _judged(
+    arguments: argparse.Namespace, loaded: "LoadedTrajectories"
+) -> "TrajectoryEvaluation":
+    """Judge the trajectories of a file, and show the progress."""
+    from cnpgen.addons.trajectories.evaluate_trajectories import evaluate_trajectories
+
+    quiet = arguments.quiet or not sys.stderr.isatty()
+    with Meter(quiet=quiet, noun="trajectory") as meter:
+        meter.begin(f"judging {arguments.file}", len(loaded.trajectories))
+        return evaluate_trajectories(
+            loaded.problem,
+            loaded.trajectories,
+            interpolation=arguments.interpolation,
+            noise=arguments.noise,
+            time_jitter=arguments.time_jitter,
+            ignore_velocities=bool(arguments.ignore_velocities),
+            max_jerk=arguments.max_jerk,
+            step=arguments.step,
+            workers=arguments.workers or 1,
+            progress=meter,
+        )
+
+
 def _draw_trajectory(
     found: "TrajectoryEvaluation",
     picture: str,
     index: int | None,
-    labels: tuple[str, ...],
+    labels: Names,
 ) -> None:
     """Draw a trajectory, by default the first that is not valid, and mark its violations."""
     from cnpgen.addons.trajectories.trajectory_plot import plot_trajectory

@@ -7,12 +7,16 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Any, Literal
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-from cnpgen.addons.trajectories.interpolate import bounded_jerk, interpolated
+from cnpgen.addons.trajectories.curve_family import CurveFamily
+from cnpgen.addons.trajectories.interpolate import (
+    Interpolation,
+    bounded_jerk,
+    interpolated,
+)
 from cnpgen.addons.trajectories.judge_family import FamilyJudge
 from cnpgen.addons.trajectories.judge_samples import (
     NO_JITTER_BOUND,
@@ -28,7 +32,7 @@ from cnpgen.addons.trajectories.trajectory_verdict import (
     Statement,
     TrajectoryVerdict,
 )
-from cnpgen.arrays import Array
+from cnpgen.arrays import Array, JsonObject, Mask
 from cnpgen.errors import UsageError, counted
 from cnpgen.judges.plans.judge import check_step
 from cnpgen.plans.evaluate import MAX_VERDICT_STEP_S, judged_in_parts
@@ -90,7 +94,7 @@ class TrajectoryEvaluation:
         return dict(Counter(each.source for each in self.errors if each.source))
 
     @property
-    def valid(self) -> NDArray[np.bool_]:
+    def valid(self) -> Mask:
         """Whether each trajectory is proven to be valid, or a valid motion through it exists, shape (N,)."""
         return np.array([verdict.valid for verdict in self.verdicts], bool)
 
@@ -105,9 +109,9 @@ class TrajectoryEvaluation:
         """Who states the limits that were judged: quantity -> source."""
         return judged_sources(*open_problem(self.problem))
 
-    def summary(self) -> dict[str, Any]:
+    def summary(self) -> JsonObject:
         """Return the summary of all trajectories for JSON ('cnpgen docs trajectories')."""
-        conditions: dict[str, dict[str, Any]] = {}
+        conditions: dict[str, JsonObject] = {}
         for verdict in self.verdicts:
             for name, entry in verdict.conditions.items():
                 counts = conditions.setdefault(
@@ -140,7 +144,7 @@ def evaluate_trajectories(
     problem: Problem | StoredProblem | str | Path,
     trajectories: Sequence[Trajectory],
     *,
-    interpolation: Literal["hold", "linear", "cubic", "quintic"] | None = None,
+    interpolation: Interpolation | None = None,
     noise: ArrayLike | None = None,
     time_jitter: float | None = None,
     max_jerk: ArrayLike | None = None,
@@ -184,24 +188,21 @@ def evaluate_trajectories(
     """
     check_step(step := number("step", step))
     record = problem_of_samples(problem)
-    n = len(record.joint_names)
     check_trajectories(trajectories, record)
     if interpolation is not None and max_jerk is not None:
-        raise UsageError(
-            "interpolation and max_jerk exclude each other", concerns="interpolation"
-        )
-    values = None if noise is None else non_negative("noise", noise, 3)
+        text = "interpolation and max_jerk exclude each other"
+        raise UsageError(text, concerns="interpolation")
     jitter = None
     if time_jitter is not None:
         jitter = float(non_negative("time_jitter", time_jitter, 1)[0])
-    jerk = None if max_jerk is None else non_negative("max_jerk", max_jerk, n)
+    n = len(record.joint_names)
     task = partial(
         _judge,
         record=record,
         interpolation=interpolation,
-        noise=values,
+        noise=None if noise is None else non_negative("noise", noise, 3),
         jitter=jitter,
-        max_jerk=jerk,
+        max_jerk=None if max_jerk is None else non_negative("max_jerk", max_jerk, n),
         step=step,
     )
     chosen = tuple(trajectories)
@@ -285,7 +286,7 @@ def non_negative(name: str, value: ArrayLike, size: int) -> Array:
 def _judge(  # noqa: PLR0917 - the arguments of evaluate_trajectories
     trajectories: Sequence[Trajectory],
     record: ProblemRecord,
-    interpolation: Literal["hold", "linear", "cubic", "quintic"] | None,
+    interpolation: Interpolation | None,
     noise: Array | None,
     jitter: float | None,
     max_jerk: Array | None,
@@ -313,24 +314,23 @@ def _judge_assumed(
     judge: FamilyJudge,
     trajectory: Trajectory,
     noise: Array,
-    interpolation: Literal["hold", "linear", "cubic", "quintic"] | None,
+    interpolation: Interpolation | None,
     max_jerk: Array | None,
 ) -> TrajectoryVerdict:
     """Judge all curves that meet a stated assumption."""
+    undecided = partial(
+        TrajectoryVerdict, Decision.UNDECIDED, duration=trajectory.duration
+    )
     if not np.isfinite(noise).all():
-        return TrajectoryVerdict(
-            Decision.UNDECIDED, NO_JITTER_BOUND, duration=trajectory.duration
-        )
+        return undecided(NO_JITTER_BOUND)
+    family: CurveFamily | None
     if max_jerk is None:
         family = interpolated(trajectory, interpolation, noise)
         text = f"{interpolation} interpolation"
     else:
-        bounded = bounded_jerk(trajectory, max_jerk, noise)
-        if bounded is None:
-            return TrajectoryVerdict(
-                Decision.UNDECIDED, CONTRADICTION, duration=trajectory.duration
-            )
+        family = bounded_jerk(trajectory, max_jerk, noise)
         largest = ", ".join(f"{value:g}" for value in np.unique(max_jerk))
-        family = bounded
         text = f"jerks of at most {largest} rad/s^3"
+    if family is None:
+        return undecided(CONTRADICTION)
     return replace(judge(family, trajectory), assumption=text)

@@ -19,12 +19,16 @@ import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import ArrayLike
 
+from cnpgen.addons.trajectories.samples import (
+    checked_samples,
+    resampled,
+    sampled_boundary,
+)
 from cnpgen.arrays import Array
 from cnpgen.errors import UsageError
 from cnpgen.schema.argument_types import checked_arguments
 from cnpgen.schema.arguments import numbers
 from cnpgen.trajectory.boundary import Boundary, assemble
-from cnpgen.trajectory.samples import checked_samples, resampled, sampled_boundary
 from cnpgen.trajectory.spline import basis, chebyshev, clamped_knots
 from cnpgen.trajectory.spline_motion import Motion, scaled_to_duration
 from cnpgen.trajectory.trajectory_spec import TrajectorySpec
@@ -274,7 +278,7 @@ class _Fit:
 def _third_derivative(points: int, degree: int) -> Array:
     """Return rows of norm 1 that penalize p''': they select the smoothest path if the samples do not determine it."""
     rows = basis(chebyshev(4 * points), points, degree, 3)
-    return np.asarray(rows / np.linalg.norm(rows, 2))
+    return rows / np.linalg.norm(rows, 2)
 
 
 @cache

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Literal
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from cnpgen.addons.trajectories.evaluate_trajectories import (
     check_trajectories,
@@ -19,8 +19,9 @@ from cnpgen.addons.trajectories.evaluate_trajectories import (
 )
 from cnpgen.addons.trajectories.fit import fit_motion, largest_error
 from cnpgen.addons.trajectories.sampled_trajectory import Trajectory
+from cnpgen.addons.trajectories.samples import sampled_boundary
 from cnpgen.addons.trajectories.trajectory_scenes import problem_of_samples
-from cnpgen.arrays import Array
+from cnpgen.arrays import Array, Mask
 from cnpgen.errors import UsageError
 from cnpgen.judges.plans.continuous_collision import is_contact
 from cnpgen.machine.threads import one_thread
@@ -34,7 +35,6 @@ from cnpgen.schema.argument_types import checked_arguments
 from cnpgen.store.dataset_spec import StoredProblem
 from cnpgen.store.scene_table import OBSTACLE_POSES
 from cnpgen.trajectory.boundary import Boundary, join_boundaries
-from cnpgen.trajectory.samples import sampled_boundary
 from cnpgen.trajectory.spline_motion import Motion
 from cnpgen.trajectory.trajectory_spec import MAX_CONTROL_POINTS, TrajectorySpec
 from cnpgen.world.world import World
@@ -80,9 +80,9 @@ class ImportedTrajectories:
     snapped: Array
 
     @property
-    def meets_samples(self) -> NDArray[np.bool_]:
+    def meets_samples(self) -> Mask:
         """Whether each plan is within the stated error of its samples, shape (N,)."""
-        return np.asarray(self.deviation <= self.max_deviation)
+        return self.deviation <= self.max_deviation
 
 
 @checked_arguments

@@ -6,13 +6,12 @@ subdivision, and smooth conditions at samples and local maxima. A sampled trajec
 without phases has the share of its duration as phase.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from itertools import chain, product
 from typing import TypeVar, cast
 
 import numpy as np
-from numpy.typing import NDArray
 
 from cnpgen.addons.trajectories.curve_family import ORDERS, UNDEFINED, CurveFamily
 from cnpgen.addons.trajectories.refuted_torques import TorqueLimit
@@ -24,8 +23,8 @@ from cnpgen.addons.trajectories.trajectory_verdict import (
     TrajectoryVerdict,
 )
 from cnpgen.addons.trajectories.uncertainty import uncertainty_of
-from cnpgen.arrays import Array
-from cnpgen.judges.plans.bernstein import find_maximum
+from cnpgen.arrays import Array, Indices, Mask
+from cnpgen.judges.plans.bernstein import Maximum, find_maximum
 from cnpgen.judges.plans.continuous_collision import (
     check_continuous_collision,
     is_contact,
@@ -168,24 +167,15 @@ class FamilyJudge:
                 duration=family.duration,
                 samples=len(s),
             )
-        if scene is None:
-            poses = self._obstacle_poses(states.q, states.dq, trajectory.parameters)
-            scenes = self._possible_scenes(family, states, poses, trajectory.parameters)
-            # Poses that the samples state replace those that follow from the ends of
-            # the curve.
-            if (placed := trajectory.obstacle_poses) is not None:
-                for each in (poses, *scenes):
-                    each[: len(placed)] = placed
-        else:
-            poses = scene
-            scenes = []
+        scenes = self._scenes(family, states, trajectory, scene)
+        poses = scenes[0]
         self._world.set_path(states.q, states.dq, states.ddq, poses, states.jerk)
         phase_of = trajectory.phase_of()
         context = evaluation_context(
             self._problem, family, poses, self._world, samples, table, phase_of
         )
         errors = uncertainty_of(
-            self._problem, family, self._moved, [poses, *scenes], context.measured, s
+            self._problem, family, self._moved, scenes, context.measured, s
         )
         measured = [errors.add(condition, s) for condition in context.measured]
         context = replace(context, measured=measured, with_uncertainty=errors.add)
@@ -198,6 +188,26 @@ class FamilyJudge:
         names = list(by_name([entry.margin for entry in entries]))
         # Conditions of one name get numbered names, in the order of the entries.
         return _verdict(dict(zip(names, entries, strict=True)), family.duration, len(s))
+
+    def _scenes(
+        self,
+        family: CurveFamily,
+        states: EvaluatedTrajectory,
+        trajectory: Trajectory,
+        scene: Array | None,
+    ) -> list[Array]:
+        """Return the scene of the nominal curve, then those of other curves of the family, shape (width,) each."""
+        if scene is not None:
+            return [scene]
+        parameters = trajectory.parameters
+        poses = self._obstacle_poses(states.q, states.dq, parameters)
+        scenes = [poses, *self._possible_scenes(family, states, poses, parameters)]
+        # Poses that the samples state replace those that follow from the ends of the
+        # curve.
+        if (placed := trajectory.obstacle_poses) is not None:
+            for each in scenes:
+                each[: len(placed)] = placed
+        return scenes
 
     def _obstacle_poses(self, q: Array, dq: Array, parameters: Array | None) -> Array:
         """Place the obstacles, and the puck of a hit, by the tip at both ends."""
@@ -300,7 +310,7 @@ def _doubt(margin: Margin, error: float) -> str:
     return f"{margin.name}: known up to {error:.2g} {margin.unit}, which some curves need to be valid"
 
 
-def _share(mask: NDArray[np.bool_], t: Array) -> float:
+def _share(mask: Mask, t: Array) -> float:
     """Return the share of time in which a condition holds at both ends of the intervals between times."""
     return float(np.diff(t) @ (mask[1:] & mask[:-1])) / float(t[-1])
 
@@ -310,58 +320,92 @@ def _limit_entries(
     family: CurveFamily,
     smooth: CurveFamily | None,
     samples: Samples,
-) -> list[ConditionDecision]:
+) -> Iterator[ConditionDecision]:
     """Decide the joint limits.
 
     A violation by the smooth curve leaves a limit undecided.
     """
-    entries = []
     curves = [family] if smooth is None else [family, smooth]
     states = [curve.evaluate(samples.s, jerk=True) for curve in curves]
-    bounds_at = dict(zip(ORDERS, family.bounds_at(samples.s), strict=True))
-    bounds = dict(zip(ORDERS, family.bounds, strict=True))
-    n = len(limits.joints)
-    rows = np.arange(2 * n) % n
+    bounds_at = family.bounds_at(samples.s)
     for limit, constraint in enumerate(limits.constraints):
-        name = quantity_of(constraint)
-        bound = limits.bounds[limit]
-        scale = limits.scale[limit]
-        # Violations relative to the tolerance: above 1 they count.
-        nominal, *others = (
-            (getattr(curve.polynomials, name)[..., rows] - bound) / scale
-            for curve in curves
+        order = ORDERS.index(quantity_of(constraint))
+        worst, certain = _proven_violations(limits, limit, curves, order)
+        margin = limits.margin_at(limit, worst, float(worst[2] * family.duration))
+        # Shares of time are measured at the samples.
+        possible, least = _sampled_violations(
+            limits,
+            limit,
+            [getattr(state, ORDERS[order]) for state in states],
+            bounds_at[order],
         )
-        # The scale has the sign of the side of the limit.
-        error = bounds[name][:, rows] / np.abs(scale)
-        # The worst of all curves: nominal plus error.
-        possible = find_maximum(nominal + error, family.edges)
-        for other in others:
-            possible = find_maximum(other, family.edges, possible)
-        # What every curve violates at least: nominal minus error.
-        certain = find_maximum(nominal - error, family.edges)[0]
-        t = float(possible[2] * family.duration)
-        margin = limits.margin_at(limit, possible, t)
-        span = min(
-            int(np.searchsorted(family.edges, possible[2], "right")) - 1,
-            len(family.t) - 2,
+        yield _decided(
+            margin,
+            _uncertainty_at(curves, order, worst[1] % len(limits.joints), worst[2]),
+            certain,
+            _share(least > 1, samples.t),
+            _share((possible > 1) & (least <= 1), samples.t),
         )
-        joint = possible[1] % n
-        there = [
-            getattr(curve.evaluate(np.array(possible[2:]), jerk=True), name)[joint, 0]
-            for curve in curves
-        ]
-        # The curves of both interpolations differ, which is an uncertainty, too.
-        uncertainty = max(float(bounds[name][span, joint]), float(np.ptp(there)))
-        at, *others = (
-            (getattr(state, name)[rows].T - bound) / scale for state in states
-        )
-        error_at = bounds_at[name][rows].T / np.abs(scale)
-        highest = np.max([at + error_at, *others], axis=(0, 2))
-        lowest = (at - error_at).max(axis=1)
-        violated = _share(lowest > 1, samples.t)
-        share = _share((highest > 1) & (lowest <= 1), samples.t)
-        entries.append(_decided(margin, uncertainty, certain, violated, share))
-    return entries
+
+
+def _proven_violations(
+    limits: ProvenJointLimits, limit: int, curves: Sequence[CurveFamily], order: int
+) -> tuple[Maximum, float]:
+    """Return the largest violation of a limit by any curve, and that which every curve has at least.
+
+    They are relative to the tolerance: above 1 they count.
+    """
+    family = curves[0]
+    scale = limits.scale[limit]
+    rows = _sides(limits)
+    nominal, *others = (
+        (getattr(curve.polynomials, ORDERS[order])[..., rows] - limits.bounds[limit])
+        / scale
+        for curve in curves
+    )
+    # The scale has the sign of the side of the limit.
+    error = family.bounds[order][:, rows] / np.abs(scale)
+    # The worst of all curves: nominal plus error.
+    possible = find_maximum(nominal + error, family.edges)
+    for other in others:
+        possible = find_maximum(other, family.edges, possible)
+    # What every curve violates at least: nominal minus error.
+    return possible, find_maximum(nominal - error, family.edges)[0]
+
+
+def _sampled_violations(
+    limits: ProvenJointLimits, limit: int, values: Sequence[Array], error: Array
+) -> tuple[Array, Array]:
+    """Return the largest relative violations at the samples by any curve, and by every curve, shape (K,) each.
+
+    The values of the family and of another curve, and the errors of the family, have
+    shape (n, K).
+    """
+    scale = limits.scale[limit]
+    rows = _sides(limits)
+    at, *others = ((each[rows].T - limits.bounds[limit]) / scale for each in values)
+    error_at = error[rows].T / np.abs(scale)
+    highest = np.max([at + error_at, *others], axis=(0, 2))
+    return np.asarray(highest), np.asarray((at - error_at).max(axis=1))
+
+
+def _sides(limits: ProvenJointLimits) -> Indices:
+    """Return the joints of the lower limits, then of the upper ones, shape (2 n,)."""
+    n = len(limits.joints)
+    return np.arange(2 * n) % n
+
+
+def _uncertainty_at(
+    curves: Sequence[CurveFamily], order: int, joint: int, phase: float
+) -> float:
+    """Return the error of a joint's value at a phase; the curves of both interpolations differ, which is one, too."""
+    family = curves[0]
+    at = np.array([phase])
+    values = [
+        getattr(curve.evaluate(at, jerk=True), ORDERS[order])[joint, 0]
+        for curve in curves
+    ]
+    return max(float(family.bounds_at(at)[order][joint, 0]), float(np.ptp(values)))
 
 
 def _measured_entries(context: EvaluationContext) -> list[ConditionDecision]:
@@ -411,14 +455,12 @@ def _certain(context: EvaluationContext, condition: MeasuredCondition) -> Array:
     # A violation includes the error once; subtracted twice, what every curve has is
     # left.
     certain = condition.violation - 2 * condition.uncertainty - excess
-    return np.asarray(
-        certain / np.maximum(condition.tolerance, ZERO_TOLERANCE)[:, None]
-    )
+    return certain / np.maximum(condition.tolerance, ZERO_TOLERANCE)[:, None]
 
 
 def _violation_masks(
     context: EvaluationContext, condition: MeasuredCondition
-) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+) -> tuple[Mask, Mask]:
     """Return masks of the samples that every curve violates, and that some curve violates, shape (K,)."""
     if is_contact(condition.constraint):
         pairs = pairs_of(context.world, condition.constraint)

@@ -33,6 +33,7 @@ from cnpgen.addons.trajectories.refuted_limits import (
     BOTH,
     VELOCITIES,
     RefutedLimit,
+    absolute_limits,
     largest_values,
     refuted_limits,
 )
@@ -47,6 +48,7 @@ from cnpgen.addons.trajectories.trajectory_verdict import (
     TrajectoryVerdict,
 )
 from cnpgen.addons.trajectories.velocity_by_position import VelocityByPosition
+from cnpgen.addons.trajectories.window_program import TorqueBounds
 from cnpgen.addons.trajectories.witness import witness
 from cnpgen.arrays import Array
 from cnpgen.judges.plans.bernstein import find_maximum
@@ -103,14 +105,14 @@ def judge_samples(
     """Judge the motion that samples resolve.
 
     Jitter must be part of the errors of the values (``with_jitter``) but for the curves
-    that meet samples within it. For the scene see ``FamilyJudge``.
+    that meet samples within it. The scene is that of ``FamilyJudge``.
     """
     limits = judge.limits(trajectory.parameters)
     ends = acceleration_limits(limits)
     moved = with_jitter(errors, limits, trajectory)
     exact = is_negligible(moved, trajectory, ends.acceleration)
     detail = ""
-    tries = _curves(trajectory, errors, limits, ends, exact=exact)
+    tries = _curves(judge, trajectory, errors, ends, exact=exact)
     for curve, step in tries:
         excess = _joint_limit_excess(curve, limits)
         if excess is None:
@@ -128,7 +130,8 @@ def judge_samples(
             Decision.UNDECIDED, NO_JITTER_BOUND, duration=trajectory.duration
         )
     # A controller connects positions that are so close by lines.
-    if exact and _is_dense(trajectory):
+    is_dense = np.diff(trajectory.t).max() <= MAX_LINEAR_SPAN_S
+    if exact and is_dense and trajectory.dq is None:
         line = interpolated(trajectory, "linear", noise)
         smooth = through_positions(trajectory, SMOOTH_NEIGHBORS)
         found = judge(line, trajectory, scene=scene, smooth=smooth)
@@ -162,30 +165,17 @@ def acceleration_limits(
     limits: ProvenJointLimits, tolerance_share: float = TOLERANCE_SHARE
 ) -> AccelerationLimits:
     """Return the smallest acceleration and jerk limits of a problem with most of their tolerances."""
-    n = len(limits.joints)
-    smallest = {"ddq": np.full(n, np.inf), "jerk": np.full(n, np.inf)}
-    for constraint, bounds, tolerance in zip(
-        limits.constraints, limits.bounds, limits.tolerance, strict=True
-    ):
-        quantity = quantity_of(constraint)
-        if quantity in smallest:
-            # Limits of both signs may differ, and the curve uses one number for both.
-            allowed = np.minimum(-bounds[:n], bounds[n:]) + tolerance_share * tolerance
-            smallest[quantity] = np.minimum(
-                smallest[quantity], np.maximum(allowed, 0.0)
-            )
-    return AccelerationLimits(smallest["ddq"], smallest["jerk"])
-
-
-def _is_dense(trajectory: Trajectory) -> bool:
-    """Return whether positions without derivatives are close enough to be connected by lines."""
-    return trajectory.dq is None and np.diff(trajectory.t).max() <= MAX_LINEAR_SPAN_S
+    # Limits of both signs may differ, and the curve uses one number for both.
+    smallest = absolute_limits(limits, np.minimum, tolerance_share)
+    return AccelerationLimits(
+        np.maximum(smallest["ddq"], 0.0), np.maximum(smallest["jerk"], 0.0)
+    )
 
 
 def _curves(
+    judge: FamilyJudge,
     trajectory: Trajectory,
     errors: SampleErrors,
-    limits: ProvenJointLimits,
     ends: AccelerationLimits,
     *,
     exact: bool,
@@ -202,9 +192,23 @@ def _curves(
         return
     yield curve, MAX_STEP_S
     for share in WITNESS_SHARES:
+        limits = judge.limits(trajectory.parameters)
         limit = acceleration_limits(limits, share).acceleration
-        if (curve := limited_witness(trajectory, errors, limit)) is not None:
+        torques = _torque_bounds(judge, trajectory, share)
+        curve = limited_witness(trajectory, errors, limit, torques)
+        if curve is not None:
             yield curve, MAX_STEP_S
+
+
+def _torque_bounds(
+    judge: FamilyJudge, trajectory: Trajectory, tolerance_share: float
+) -> TorqueBounds | None:
+    """Return the torque limits with most of their tolerances, or None without any."""
+    allowed = judge.torque_limit()
+    if allowed is None:
+        return None
+    limit = allowed.limit + tolerance_share * allowed.tolerance
+    return TorqueBounds(partial(judge.torques, parameters=trajectory.parameters), limit)
 
 
 def _joint_limit_excess(curve: CurveFamily, limits: ProvenJointLimits) -> str | None:

@@ -15,9 +15,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cnpgen.addons.trajectories.lerobot_tables import (
+    LEROBOT_ACTION,
     LEROBOT_ENVIRONMENT,
     LEROBOT_INFO,
+    LEROBOT_STATE,
 )
+from cnpgen.arrays import JsonObject
 from cnpgen.errors import UsageError, requires_extra
 from cnpgen.plans.exporter import ExportedSet, Exporter, SampledPlan
 from cnpgen.plans.formats import fixed_lists, write_parquet
@@ -32,9 +35,6 @@ MAX_DATA_FILE_MB = 100
 MAX_VIDEO_FILE_MB = 200  # there are none, but readers expect the number
 DATA_PATH = "data/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"
 EPISODES_PATH = "meta/episodes/chunk-000/file-000.parquet"
-STATE = "observation.state"
-ENVIRONMENT = LEROBOT_ENVIRONMENT
-ACTION = "action"
 QUANTILES = (0.01, 0.1, 0.5, 0.9, 0.99)
 _INDICES = {
     "timestamp": "float32",
@@ -94,9 +94,9 @@ def _names(exported: ExportedSet) -> dict[str, list[str]]:
     ]
     state = [*joints, *(f"{joint}_velocity" for joint in joints)]
     return {
-        STATE: state,
-        **({ENVIRONMENT: environment} if environment else {}),
-        ACTION: list(joints),
+        LEROBOT_STATE: state,
+        **({LEROBOT_ENVIRONMENT: environment} if environment else {}),
+        LEROBOT_ACTION: list(joints),
     }
 
 
@@ -151,9 +151,11 @@ def _frames(
     count = len(plan.t) - 1
     frame = np.arange(count)
     return {
-        STATE: np.concatenate([plan.q[:-1], plan.dq[:-1]], axis=1).astype(np.float32),
-        ENVIRONMENT: np.tile(environment.astype(np.float32), (count, 1)),
-        ACTION: plan.q[1:].astype(np.float32),
+        LEROBOT_STATE: np.concatenate([plan.q[:-1], plan.dq[:-1]], axis=1).astype(
+            np.float32
+        ),
+        LEROBOT_ENVIRONMENT: np.tile(environment.astype(np.float32), (count, 1)),
+        LEROBOT_ACTION: plan.q[1:].astype(np.float32),
         "timestamp": (frame / rate).astype(np.float32),
         "frame_index": frame,
         "episode_index": np.full(count, number),
@@ -186,7 +188,7 @@ def _write_episodes(
     lengths = np.array([len(episode["index"]) for episode in episodes])
     ends = np.cumsum(lengths)
     chunks = np.divmod(files, MAX_CHUNK_FILES)
-    table: dict[str, Any] = {
+    table: JsonObject = {
         "episode_index": np.arange(len(episodes)),
         "tasks": [[task]] * len(episodes),
         "length": lengths,
@@ -209,7 +211,7 @@ def _write_tasks(path: Path, task: str) -> None:
     import pyarrow
 
     index = "__index_level_0__"
-    columns: list[dict[str, Any]] = [
+    columns: list[JsonObject] = [
         {
             "name": "task_index",
             "field_name": "task_index",
@@ -259,9 +261,9 @@ def _statistics(columns: Mapping[str, Values]) -> dict[str, dict[str, list[float
 
 def _info(
     exported: ExportedSet, names: Mapping[str, list[str]], lengths: list[int]
-) -> dict[str, Any]:
+) -> JsonObject:
     """Return the description of the dataset."""
-    features: dict[str, Any] = {
+    features: JsonObject = {
         key: {"dtype": "float32", "shape": [len(values)], "names": values}
         for key, values in names.items()
     }

@@ -1,7 +1,8 @@
 """Episodes of a LeRobotDataset v3 as tables."""
 
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +15,7 @@ from cnpgen.addons.trajectories.trajectory_table import (
     TrajectoryTable,
     Values,
 )
+from cnpgen.arrays import JsonMapping, JsonObject
 from cnpgen.errors import UsageError, nearest
 from cnpgen.robots.parameter_ranges import PARAMETER_UNITS
 from cnpgen.store.files.accounted import MISSPELT
@@ -24,6 +26,9 @@ from cnpgen.store.scene_table import OBSTACLE_POSES
 
 MAX_FEATURE_WIDTH = 10_000  # values of a feature of LeRobot
 LEROBOT_INFO = "meta/info.json"  # in a folder of LeRobot
+DATASET = "a dataset of LeRobot"  # in messages
+LEROBOT_STATE = "observation.state"
+LEROBOT_ACTION = "action"
 LEROBOT_ENVIRONMENT = "observation.environment_state"
 _INDICES = (
     "timestamp",
@@ -46,89 +51,113 @@ _POSE_NAME = re.compile(rf"{OBSTACLE_POSES}(_[0-9]+)?")  # a value of LeRobot
 
 def read_lerobot(folder: Path) -> Iterator[TrajectoryTable]:
     """Yield the episodes of a LeRobotDataset v3: states, or actions without them, with their names."""
-    info, key, names, described = _described_dataset(folder)
-    parameters = {
-        name: k for k, name in enumerate(described) if name in PARAMETER_UNITS
-    }
-    scene = [k for k, name in enumerate(described) if _POSE_NAME.fullmatch(name)]
+    info = read_description(folder)
+    features = info["features"]
+    with described(folder, DATASET):
+        key = next(key for key in (LEROBOT_STATE, LEROBOT_ACTION) if key in features)
+        names = feature_names(features[key])
+        environment = features.get(LEROBOT_ENVIRONMENT)
+        places = [] if environment is None else feature_names(environment)
+    parameters = {name: k for k, name in enumerate(places) if name in PARAMETER_UNITS}
+    scene = [k for k, name in enumerate(places) if _POSE_NAME.fullmatch(name)]
     widths = {"timestamp": 1, "episode_index": 1, key: len(names)}
     if parameters or scene:
-        widths[LEROBOT_ENVIRONMENT] = len(described)
-    read = {key, *_INDICES, *([LEROBOT_ENVIRONMENT] if described else [])}
-    unused = [name for name in info["features"] if name not in read]
+        widths[LEROBOT_ENVIRONMENT] = len(places)
+    used = {key, *_INDICES, LEROBOT_ENVIRONMENT}
+    unused = [name for name in features if name not in used]
     unused += [
         f"{LEROBOT_ENVIRONMENT} {name}"
-        for k, name in enumerate(described)
+        for k, name in enumerate(places)
         if name not in parameters and k not in scene
     ]
-    unused += _unknown_keys(info, _INFO_KEYS, "info.json", folder)
-    for name in filter(info["features"].__contains__, widths):
-        unused += _unknown_keys(info["features"][name], _FEATURE_KEYS, name, folder)
+    unused += _unknown(info, widths, folder)
     count = 0
-    for path in sorted(folder.glob("data/*/*.parquet")):
-        table = read_parquet(path)
-        known = {*info["features"], *_INDICES, *unused}
-        unused += [name for name in table.column_names if name not in known]
-        times, episodes, values, *environment = _number_columns(table, path, widths)
-        count += len(values)
-        for episode in dict.fromkeys(episodes[:, 0].tolist()):
-            rows = episodes[:, 0] == episode
-            columns: dict[str, Values] = {MESSAGE_TIME: times[rows, 0]}
-            columns |= {name: values[rows, k] for k, name in enumerate(names)}
-            columns |= {name: environment[0][rows, k] for name, k in parameters.items()}
-            if scene:
-                columns[OBSTACLE_POSES] = environment[0][rows][:, scene]
-            place = f"{folder}: episode {episode:g}"
-            _check_rate(place, columns[MESSAGE_TIME], info.get("fps"))
-            yield TrajectoryTable(place, columns, unused=tuple(unused))
-    if info.get("total_frames", count) != count:
-        stated = info["total_frames"]
-        raise UsageError(
-            f"{folder} has {count:,} frames, info.json states {stated!r:.60}"
-        )
+    for of_file, episode, read in episodes_of(folder, widths):
+        known = {*features, *_INDICES, *unused}
+        unused += [name for name in of_file if name not in known]
+        t = read["timestamp"][:, 0]
+        count += len(t)
+        columns: dict[str, Values] = {MESSAGE_TIME: t}
+        columns |= {name: read[key][:, k] for k, name in enumerate(names)}
+        columns |= {
+            name: read[LEROBOT_ENVIRONMENT][:, k] for name, k in parameters.items()
+        }
+        if scene:
+            columns[OBSTACLE_POSES] = read[LEROBOT_ENVIRONMENT][:, scene]
+        place = f"{folder}: episode {episode:g}"
+        columns[MESSAGE_TIME] = _frame_times(place, t, info.get("fps"))
+        yield TrajectoryTable(place, columns, unused=tuple(unused))
+    if (stated := info.get("total_frames", count)) != count:
+        text = f"{folder} has {count:,} frames, info.json states {stated!r:.60}"
+        raise UsageError(text)
 
 
-def _described_dataset(
-    folder: Path,
-) -> tuple[dict[str, Any], str, list[str], list[str]]:
-    """Return the description of a dataset, the feature of its states, and the names of states and environment."""
+@contextmanager
+def described(folder: Path, what: str) -> Iterator[None]:
+    """Report that a description is not that of ``what`` if it cannot be read as such."""
     try:
-        info = parse_json(
-            read_file(folder / LEROBOT_INFO, max_bytes=MAX_TABLE_BYTES).decode()
-        )
-        features = info["features"]
-        version = str(info["codebase_version"])
-        key = next(key for key in ("observation.state", "action") if key in features)
-        names = feature_names(features[key])
-        described = (
-            feature_names(features[LEROBOT_ENVIRONMENT])
-            if LEROBOT_ENVIRONMENT in features
-            else []
-        )
-    except (ValueError, KeyError, TypeError, IndexError, StopIteration) as error:
+        yield
+    except (
+        AttributeError,
+        ValueError,
+        KeyError,
+        TypeError,
+        IndexError,
+        StopIteration,
+    ) as error:
         raise UsageError(
-            f"{folder / LEROBOT_INFO} does not describe a dataset of LeRobot: {error!r:.200}"
+            f"{folder / LEROBOT_INFO} does not describe {what}: {error!r:.200}",
+            concerns="path",
         ) from error
+
+
+def read_description(folder: Path, what: str = DATASET) -> JsonObject:
+    """Return the description of a LeRobotDataset v3, which has ``features``."""
+    with described(folder, what):
+        content = read_file(folder / LEROBOT_INFO, max_bytes=MAX_TABLE_BYTES)
+        info: JsonObject = parse_json(content.decode())
+        version = str(info["codebase_version"])
+        info["features"].keys()
     if not version.startswith("v3"):
-        raise UsageError(
-            f"{folder} has LeRobot's format {version}, expected v3.0: convert it with LeRobot"
-        )
+        text = f"{folder} has LeRobot's format {version}, expected v3.0: convert it with LeRobot"
+        raise UsageError(text, concerns="path")
     pattern = str(info.get("data_path", "data/"))
     if not pattern.startswith("data/"):
-        raise UsageError(
-            f"{folder}: data_path must begin with data/, got {pattern!r:.60}"
-        )
-    return info, key, names, described
+        text = f"{folder}: data_path must begin with data/, got {pattern!r:.60}"
+        raise UsageError(text, concerns="path")
+    return info
 
 
-def _number_columns(table: Any, path: Path, widths: Mapping[str, int]) -> list[Values]:
-    """Return the columns of a file with their numbers of values, shape (K, width) each."""
-    missing = [name for name in widths if name not in table.column_names]
-    if missing:
-        raise UsageError(
-            f"{path}: there is no column {missing[0]!r}, only {', '.join(table.column_names)}"
-        )
-    return [number_column(table, name, path, width) for name, width in widths.items()]
+def episodes_of(
+    folder: Path, widths: Mapping[str, int]
+) -> Iterator[tuple[list[str], float, dict[str, Values]]]:
+    """Yield the names of a file's columns, and of each episode in it the index and columns of shape (K, width)."""
+    for path in sorted(folder.glob("data/*/*.parquet")):
+        table = read_parquet(path)
+        if missing := [name for name in widths if name not in table.column_names]:
+            raise UsageError(
+                f"{path}: there is no column {missing[0]!r}, only {', '.join(table.column_names)}",
+                concerns="path",
+            )
+        columns = {
+            name: number_column(table, name, path, width)
+            for name, width in widths.items()
+        }
+        index = columns["episode_index"][:, 0]
+        for episode in dict.fromkeys(index.tolist()):
+            rows = index == episode
+            yield (
+                table.column_names,
+                episode,
+                {name: values[rows] for name, values in columns.items()},
+            )
+
+
+def _unknown(info: JsonMapping, names: Iterable[str], folder: Path) -> Iterator[str]:
+    """Yield the unknown keys of a description and of the features that are read."""
+    yield from _unknown_keys(info, _INFO_KEYS, "info.json", folder)
+    for name in filter(info["features"].__contains__, names):
+        yield from _unknown_keys(info["features"][name], _FEATURE_KEYS, name, folder)
 
 
 def _unknown_keys(
@@ -147,14 +176,25 @@ def _unknown_keys(
     return [f"attribute {key} of {of}" for key in unknown]
 
 
-def _check_rate(place: str, t: Values, rate: Any) -> None:
-    """Check that times agree with the frames per second that a dataset states."""
+def _frame_times(place: str, t: Values, rate: Any) -> Values:
+    """Return times without their rounding to float32, if they are multiples of the period of the frames.
+
+    Between 1 and 2 s, the rounding is up to 6e-8 s, which at 1 rad/s is as much as the
+    rounding of the positions.
+
+    Raises:
+        UsageError: The times do not agree with the frames per second that a dataset
+            states.
+    """
     if not isinstance(rate, int | float) or not rate > 0:
         raise UsageError(f"{place}: fps must be above 0, got {rate!r:.60}")
     steps = np.diff(t)
     if len(steps) and abs(float(np.median(steps)) * rate - 1) > MAX_RATE_DEVIATION:
         step = float(np.median(steps))
         raise UsageError(f"{place} has steps of {step:.3g} s, and its fps is {rate:g}")
+    frames = np.round(t * rate) / rate
+    rounding = np.spacing(np.abs(t).astype(np.float32))
+    return frames if (np.abs(frames - t) <= rounding).all() else t
 
 
 def feature_names(feature: Any, unnamed: str = "q{}") -> list[str]:

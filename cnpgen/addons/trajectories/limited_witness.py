@@ -1,238 +1,128 @@
-"""A smooth curve within the errors of all samples and within acceleration limits.
+"""A smooth curve within the errors of all samples, and within acceleration and torque limits.
 
 Where a motion changes its acceleration faster than the samples resolve, the smoothest
 spline swings over the limit that the motion keeps (Gibbs). There the spline is
 computed again: of all splines within the errors of the samples and within the limits at
-many points, it has the smallest integral of the squared jerk (a quadratic program of
-some spans). All other coefficients stay, so the curve keeps its derivatives.
+many points, it has the smallest integral of the squared jerk (``window_program``). All
+other coefficients stay, so the curve keeps its derivatives. Accelerations are limited
+joint by joint, then torques, for all joints together.
 """
 
-from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
 from cnpgen.addons.trajectories.curve_family import CurveFamily
 from cnpgen.addons.trajectories.interpolate import data_of, family_of_data
 from cnpgen.addons.trajectories.sample_errors import SampleErrors
 from cnpgen.addons.trajectories.sampled_trajectory import Trajectory
+from cnpgen.addons.trajectories.window_program import (
+    JointSplines,
+    Limits,
+    Part,
+    TorqueBounds,
+    refined,
+    smoothest,
+)
 from cnpgen.addons.trajectories.witness import DEGREE, MIN_ERRORS, fitted, is_within
 from cnpgen.arrays import Array
+
+if TYPE_CHECKING:
+    from scipy.interpolate import BSpline
 
 WINDOW_SPANS = 10  # on both sides of a violation
 REFINED_SPANS = 3  # on both sides of a violation, with further knots
 PARTS = 6  # of these spans between knots, times the size
-POINTS_PER_INTERVAL = 8  # of knots, at which the limits hold
 MAX_WINDOWS = 12  # of a joint
 MAX_SIZE = 3  # of a window, in multiples of the numbers of spans
-PROGRAM_TOLERANCE = 1e-9
-SPLINE_REGULARIZATION = 1e-9  # of the curvature of the quadratic program
-PROGRAM_LIMIT_SHARE = 1 - 1e-4  # of the limit, in the program: it holds at points
-ERROR_SHARE = 0.999  # of the errors, for the rounding of the program
-
-
-@dataclass(frozen=True, eq=False)
-class _Spline:
-    """Spline of one joint."""
-
-    knots: Array
-    coefficients: Array
-
-    def at(self, t: Array, order: int = 0) -> Array:
-        """Evaluate a derivative at times [s]."""
-        from scipy.interpolate import BSpline
-
-        spline = BSpline(self.knots, self.coefficients, DEGREE)
-        return np.asarray(spline(t, order))
-
-    def refined(self, times: Array) -> "_Spline":
-        """Return the same curve with further knots."""
-        from scipy.interpolate import BSpline
-
-        spline = BSpline(self.knots, self.coefficients, DEGREE)
-        for time in times[~np.isin(times, self.knots)]:
-            spline = spline.insert_knot(float(time))
-        return _Spline(spline.t, spline.c[: len(spline.t) - DEGREE - 1])
-
-    def points(self, low: float, high: float) -> Array:
-        """Return points between two times, several in every interval of knots."""
-        inside = np.unique(self.knots[(self.knots >= low) & (self.knots <= high)])
-        parts = np.arange(POINTS_PER_INTERVAL) / POINTS_PER_INTERVAL
-        points = inside[:-1, None] + np.diff(inside)[:, None] * parts
-        return np.append(points.ravel(), inside[-1])
+MAX_COUPLED_EXCESS = 0.2  # relative; a larger one is that of the motion itself
 
 
 def limited_witness(
-    trajectory: Trajectory, errors: SampleErrors, limit: Array
+    trajectory: Trajectory,
+    errors: SampleErrors,
+    limit: Array,
+    torques: TorqueBounds | None = None,
 ) -> CurveFamily | None:
     """Return a curve within the errors of all samples, whose accelerations are within limits [rad/s^2], shape (n,).
 
-    None without a spline within the errors, with a jitter of the times, or if the
-    program finds none.
+    Its torques are within their limits if the program finds such a curve, too. None
+    without a spline within the errors, with a jitter of the times, or if the program
+    finds none.
     """
+    from scipy.interpolate import BSpline
+
     smooth = None if errors.t else fitted(trajectory, errors, 0.0)
     if smooth is None or not np.isfinite(limit).all():
         return None
     allowed = np.maximum(errors.values, MIN_ERRORS)
+    n = len(limit)
+    data = [[values[:, joint] for values in data_of(trajectory)] for joint in range(n)]
     splines = []
-    for joint, bound in enumerate(limit.tolist()):
-        data = [values[:, joint] for values in data_of(trajectory)]
-        spline = _Spline(smooth.knots, smooth.coefficients[:, joint])
-        limited = _limited(spline, trajectory.t, data, allowed, bound)
+    for joint in range(n):
+        spline = BSpline(smooth.t, smooth.c[:, joint], DEGREE)
+        limits = Limits(limit[joint : joint + 1])
+        limited = _limited(
+            [spline], trajectory.t, data[joint : joint + 1], allowed, limits
+        )
         if limited is None:
             return None
-        splines.append(limited)
+        splines += limited
+    if torques is not None:
+        limits = Limits(limit, torques)
+        splines = _limited(splines, trajectory.t, data, allowed, limits) or splines
     # The programs meet errors up to their tolerance, so all samples are compared again.
-    if not is_within(_JointSplines(splines), trajectory, errors):
+    joints = JointSplines(splines)
+    if not is_within(joints.at, trajectory, errors):
         return None
     # Between knots of any joint, every spline is one quintic. Its q, dq and ddq at both
     # ends determine it exactly.
-    times = np.unique(np.concatenate([spline.knots for spline in splines]))
-    return family_of_data(times, _JointSplines(splines).at(times))
-
-
-@dataclass(frozen=True, eq=False)
-class _JointSplines:
-    """Splines of n joints with different knots."""
-
-    splines: list[_Spline]
-
-    def at(self, t: Array) -> list[Array]:
-        """Return positions, velocities and accelerations, shape (K, n) each."""
-        return [
-            np.stack([spline.at(t, order) for spline in self.splines], axis=1)
-            for order in range(3)
-        ]
+    times = np.unique(np.concatenate([spline.t for spline in splines]))
+    return family_of_data(times, joints.at(times))
 
 
 def _limited(
-    spline: _Spline, t: Array, data: list[Array], allowed: Array, limit: float
-) -> _Spline | None:
-    """Return the spline of one joint within the limit, or None."""
+    splines: list["BSpline"],
+    t: Array,
+    data: list[list[Array]],
+    allowed: Array,
+    limits: Limits,
+) -> "list[BSpline] | None":
+    """Return the splines of some joints within the limits, or None."""
     for _ in range(MAX_WINDOWS):
-        points = spline.points(t[0], t[-1])
-        excess = np.abs(spline.at(points, 2)) - limit
+        joints = JointSplines(splines)
+        points = joints.points(t[0], t[-1])
+        excess = limits.excess(joints.at(points))
         # Each pass removes the worst excess; the window may leave others for the next
         # pass.
         if excess.max() <= 0:
-            return spline
+            return splines
+        # The dense program of all joints takes seconds.
+        if len(splines) > 1 and excess.max() > MAX_COUPLED_EXCESS:
+            return None
         sample = int(np.searchsorted(t, points[excess.argmax()]))
         found = None
-        for size in range(1, MAX_SIZE + 1):
+        for size in range(1, (MAX_SIZE if len(splines) == 1 else 1) + 1):
             # More knots and a longer part of the motion, if there is no solution.
             near = _around(t, sample, size * REFINED_SPANS)
             steps = np.diff(near)[:, None] * np.arange(1, PARTS * size) / (PARTS * size)
-            spline = spline.refined((near[:-1, None] + steps).ravel())
+            times = (near[:-1, None] + steps).ravel()
+            splines = [refined(spline, times) for spline in splines]
             window = _around(t, sample, size * WINDOW_SPANS)
             chosen = np.isin(t, window)
-            part = _Part(spline, window, [values[chosen] for values in data])
-            found = part.smoothest(allowed, PROGRAM_LIMIT_SHARE * limit)
+            parts = [
+                Part(spline, window, [values[chosen] for values in columns])
+                for spline, columns in zip(splines, data, strict=True)
+            ]
+            found = smoothest(parts, allowed, limits, (near[0], near[-1]))
             if found is not None:
                 break
         if found is None:
             return None
-        spline = found
+        splines = found
     return None
 
 
 def _around(t: Array, sample: int, count: int) -> Array:
     """Return the times of a sample and of some on both sides."""
     return t[max(sample - count, 0) : sample + count + 1]
-
-
-@dataclass(frozen=True, eq=False)
-class _Part:
-    """Part of the spline of one joint between two samples, with the data at the samples in between."""
-
-    spline: _Spline
-    t: Array
-    data: list[Array]
-
-    @property
-    def span(self) -> float:
-        """Mean span [s], the unit of time of the program."""
-        return float(np.diff(self.t).mean())
-
-    @property
-    def free(self) -> NDArray[np.intp]:
-        """Indices of the coefficients whose supports are between both ends."""
-        knots = self.spline.knots
-        index = np.arange(len(self.spline.coefficients))
-        inside = (knots[index] >= self.t[0]) & (knots[index + DEGREE + 1] <= self.t[-1])
-        return np.asarray(index[inside], np.intp)
-
-    def rows(self, times: Array, order: int) -> Array:
-        """Return derivatives of the free basis functions, with a span as unit of time."""
-        from scipy.interpolate import BSpline
-
-        size = len(self.spline.coefficients)
-        basis = BSpline(self.spline.knots, np.eye(size)[:, self.free], DEGREE)
-        return np.asarray(basis(times, order) * self.span**order)
-
-    def smoothest(self, allowed: Array, limit: float) -> _Spline | None:
-        """Return the spline with the smallest jerks that meets the errors and the limit, or None."""
-        import daqp
-
-        # The error of positions is the unit of the program, so its numbers are near
-        # one.
-        free = self.free
-        unit = float(allowed[0])
-        if not len(free):
-            return None
-        curvature, gradient = self._jerks(unit)
-        rows, lower, upper = self._constraints(allowed, limit, unit)
-        # The Hessian has largest entries of 1, to which the regularization refers.
-        scale = float(np.abs(curvature).max())
-        solution: tuple[Any, ...] = daqp.solve(
-            curvature / scale + SPLINE_REGULARIZATION * np.eye(len(free)),
-            gradient / scale,
-            np.ascontiguousarray(rows),
-            upper,
-            lower,
-            np.zeros(len(rows), np.intc),
-            primal_tol=PROGRAM_TOLERANCE,
-        )
-        if solution[2] != 1:
-            return None
-        coefficients = self.spline.coefficients.copy()
-        # The program states changes in units, not the coefficients themselves.
-        coefficients[free] += unit * np.array(solution[0])
-        return _Spline(self.spline.knots, coefficients)
-
-    def _constraints(
-        self, allowed: Array, limit: float, unit: float
-    ) -> tuple[Array, Array, Array]:
-        """Return rows and both bounds of the changes: errors at the samples, and the limit at the points."""
-        points = self.spline.points(self.t[0], self.t[-1])
-        groups = [
-            (self.t, order, values, ERROR_SHARE * allowed[order])
-            for order, values in enumerate(self.data)
-        ]
-        groups.append((points, 2, np.zeros(len(points)), limit))
-        rows = []
-        lower = []
-        upper = []
-        for times, order, values, error in groups:
-            # The variables are changes: bounds are differences from the present curve.
-            now = self.spline.at(times, order)
-            factor = self.span**order / unit
-            rows.append(self.rows(times, order))
-            lower.append((values - error - now) * factor)
-            upper.append((values + error - now) * factor)
-        return np.concatenate(rows), np.concatenate(lower), np.concatenate(upper)
-
-    def _jerks(self, unit: float) -> tuple[Array, Array]:
-        """Return curvature and gradient of half the integral of the squared jerk."""
-        inner = np.unique(np.clip(self.spline.knots, self.t[0], self.t[-1]))
-        # Jerks are quadratic in every interval: exact with three nodes.
-        nodes, weights = np.polynomial.legendre.leggauss(DEGREE - 2)
-        spans = np.diff(inner)
-        # Gauss nodes x in [-1, 1] map to t = a + h (x + 1) / 2, with weights h w / 2.
-        times = (inner[:-1, None] + spans[:, None] * (nodes + 1) / 2).ravel()
-        strength = (spans[:, None] / self.span * weights / 2).ravel()
-        third = self.rows(times, 3)
-        now = self.spline.at(times, 3) * self.span**3 / unit
-        # With jerks j + R x, half the squared integral has the Hessian R^T W R and the
-        # gradient R^T W j.
-        return third.T @ (strength[:, None] * third), third.T @ (strength * now)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from pathlib import Path
@@ -16,12 +16,12 @@ from cnpgen.addons.trajectories.bag_tables import has_bags
 from cnpgen.addons.trajectories.load_options import LoadOptions
 from cnpgen.addons.trajectories.sampled_trajectory import Trajectory
 from cnpgen.addons.trajectories.table_columns import TIME_NAMES
-from cnpgen.addons.trajectories.table_reader import ReadOptions, TableReader
+from cnpgen.addons.trajectories.table_reader import TableReader
 from cnpgen.addons.trajectories.table_units import plain
 from cnpgen.addons.trajectories.trajectory_scenes import problem_of_samples, with_scenes
 from cnpgen.addons.trajectories.trajectory_table import TrajectoryTable
 from cnpgen.addons.trajectories.trajectory_tables import read_trajectory_tables
-from cnpgen.arrays import Array
+from cnpgen.arrays import AnyPath, Array, NamedNumbers, Names
 from cnpgen.errors import UsageError, either, nearest
 from cnpgen.plans.stated_units import SCALE_ATTRIBUTES, UNIT_ATTRIBUTES
 from cnpgen.problems.problem import Problem
@@ -59,19 +59,19 @@ class LoadedTrajectories:
 
     problem: ProblemRecord
     trajectories: tuple[Trajectory, ...]
-    labels: tuple[str, ...]
-    ignored: tuple[str, ...]
-    notes: tuple[str, ...] = ()
+    labels: Names
+    ignored: Names
+    notes: Names = ()
 
 
 @checked_arguments
 def load_trajectories(
-    path: str | Path,
+    path: AnyPath,
     problem: Problem | StoredProblem | str | Path,
     *,
     joints: Sequence[str] | None = None,
     velocities: Sequence[str] | None = None,
-    parameters: Mapping[str, float] | None = None,
+    parameters: NamedNumbers | None = None,
     scenes: str | Path | Sequence[SceneProblem] | None = None,
     options: LoadOptions | None = None,
     **old_keywords: Any,
@@ -105,9 +105,11 @@ def load_trajectories(
     )
     record = problem_of_samples(problem)
     _check_parameters(record, parameters or {})
-    robot = open_problem(record)[1]
-    reading = _reading(record, chosen, joints, velocities, parameters or {})
-    tables, readers, trajectories = _read(path, record, chosen, reading, robot)
+    names = (
+        _names(record, "joints", joints, record.joint_names),
+        _names(record, "velocities", velocities, ()),
+    )
+    readers, trajectories = _read(path, record, chosen, names, parameters or {})
     ignored = dict.fromkeys(name for reader in readers for name in reader.unused())
     # Keys of messages may be missing in scenes; the other ones must be there.
     keys = unmatched(chosen.allow_unused, [*ignored, *map(_key_of, ignored)])
@@ -118,34 +120,30 @@ def load_trajectories(
         record = _extrapolated(record, trajectories)
     if scenes is not None:
         elsewhere = sorted({*chosen.allow_unused}.difference(keys))
-        options_of_scenes = ReadingOptions(keys, allowed_elsewhere=elsewhere)
+        of_scenes = ReadingOptions(keys, allowed_elsewhere=elsewhere)
         record, trajectories = with_scenes(
-            record, trajectories, scenes, options=options_of_scenes
+            record, trajectories, scenes, options=of_scenes
         )
-    places = tuple(table.place for table in tables)
-    notes = dict.fromkeys(note for reader in readers for note in reader.notes)
-    return LoadedTrajectories(
-        record, trajectories, places, tuple(ignored), tuple(notes)
-    )
+    places = tuple(reader.table.place for reader in readers)
+    notes = tuple(dict.fromkeys(note for reader in readers for note in reader.notes))
+    return LoadedTrajectories(record, trajectories, places, tuple(ignored), notes)
 
 
 def _read(
-    path: str | Path,
+    path: AnyPath,
     record: ProblemRecord,
     options: LoadOptions,
-    reading: ReadOptions,
-    robot: Robot,
-) -> tuple[list[TrajectoryTable], list[TableReader], tuple[Trajectory, ...]]:
-    """Return the tables of a file, their readers and their trajectories."""
+    names: tuple[Sequence[str], Sequence[str]],
+    parameters: NamedNumbers,
+) -> tuple[list[TableReader], tuple[Trajectory, ...]]:
+    """Return the readers of the tables of a file, with the names of joints and of their velocities, and trajectories."""
+    robot = open_problem(record)[1]
+    others = *names, parameters, robot.velocity_limit
     try:
-        tables = [
-            part
+        readers = [
+            TableReader(part, record, options, *others)
             for table in read_trajectory_tables(Path(path), options)
             for part in _separated(table, options.separate_by)
-        ]
-        readers = [
-            TableReader(table, record, reading, robot.velocity_limit)
-            for table in tables
         ]
         trajectories = tuple(reader.trajectory() for reader in readers)
     except UsageError as error:
@@ -157,33 +155,7 @@ def _read(
         raise UsageError(text, argument="unit")
     for reader, trajectory in zip(readers, trajectories, strict=True):
         reader.check_units(trajectory)
-    return tables, readers, trajectories
-
-
-def _reading(
-    record: ProblemRecord,
-    options: LoadOptions,
-    joints: Sequence[str] | None,
-    velocities: Sequence[str] | None,
-    parameters: Mapping[str, float],
-) -> ReadOptions:
-    """Return the options of the reader of one table."""
-    return ReadOptions(
-        joints=_names(
-            record, "joints", record.joint_names if joints is None else joints
-        ),
-        velocities=()
-        if velocities is None
-        else _names(record, "velocities", velocities),
-        time=options.time,
-        degrees=options.unit == "deg",
-        rate=options.rate,
-        unwrap=options.unwrap,
-        drop_repeats=options.drop_repeats,
-        extrapolate=options.extrapolate,
-        separated=options.separate_by is not None,
-        parameters=parameters,
-    )
+    return readers, trajectories
 
 
 def _extrapolated(
@@ -192,11 +164,11 @@ def _extrapolated(
     """Return the problem with ranges of parameters that contain those of the trajectories."""
     values = [each.parameters for each in trajectories]
     stated = [row for row in values if row is not None]
-    return extrapolated_record(record, np.array(stated)) if stated else record
+    return extrapolated_record(record, np.array(stated))
 
 
 def _check_trajectories(
-    path: str | Path,
+    path: AnyPath,
     options: LoadOptions,
     robot: Robot,
     trajectories: Sequence[Trajectory],
@@ -217,7 +189,7 @@ def _key_of(name: str) -> str:
 
 
 def _check_meaning(
-    path: str | Path, ignored: Iterable[str], allowed: Sequence[str]
+    path: AnyPath, ignored: Iterable[str], allowed: Sequence[str]
 ) -> None:
     """Refuse unused elements that say what numbers mean, unless their loss is accepted."""
     for name in ignored:
@@ -237,9 +209,14 @@ def _check_meaning(
 
 
 def _names(
-    record: ProblemRecord, argument: str, names: Sequence[str]
-) -> tuple[str, ...]:
-    """Return names of columns, a different one for each joint of the problem."""
+    record: ProblemRecord,
+    argument: str,
+    names: Sequence[str] | None,
+    default: Names,
+) -> Names:
+    """Return names of columns, a different one for each joint of the problem, or a default."""
+    if names is None:
+        return default
     count = len(record.joint_names)
     if len(names) != count or not all(isinstance(name, str) for name in names):
         expected = f"one for each of {', '.join(record.joint_names)}"
@@ -254,7 +231,7 @@ def _names(
     return tuple(names)
 
 
-def _check_unit(path: str | Path, robot: Robot, positions: Sequence[Array]) -> None:
+def _check_unit(path: AnyPath, robot: Robot, positions: Sequence[Array]) -> None:
     """Check that positions are in rad or m, by their medians: single trajectories may be far outside of the limits."""
     median = np.median(np.concatenate(positions), axis=0)[None]
     wrong = find_implausible_value(robot, "q", median, robot.units("rad"))
@@ -314,24 +291,23 @@ def _groups_of_rows(
 
 def _of_stack(table: TrajectoryTable, index: int, count: int) -> TrajectoryTable:
     """Return one of the trajectories that are stacked along the first axis."""
-    parts = {
-        name: values[index]
-        if values.ndim == 3 or (values.ndim == 2 and len(values) == count)
-        else values
-        for name, values in table.columns.items()
-        if values.ndim == 3 or plain(name) in TIME_NAMES
-    }
-    parts |= {
-        name: values[index] if values.shape == (count,) else values
-        for name, values in table.columns.items()
-        if plain(name) in PARAMETER_UNITS
-    }
+    parts = {}
+    for name, values in table.columns.items():
+        # Times and parameters are those of one trajectory, or of all.
+        is_own = values.ndim == 3
+        if plain(name) in TIME_NAMES:
+            is_own |= values.ndim == 2 and len(values) == count
+        elif plain(name) in PARAMETER_UNITS:
+            is_own |= values.shape == (count,)
+        elif not is_own:
+            continue
+        parts[name] = values[index] if is_own else values
     return TrajectoryTable(
         f"{table.place}: trajectory {index}", parts, table.joint_names
     )
 
 
-def _check_parameters(record: ProblemRecord, parameters: Mapping[str, float]) -> None:
+def _check_parameters(record: ProblemRecord, parameters: NamedNumbers) -> None:
     """Check the names of stated parameters."""
     known = record.parameters.names
     for name in parameters:

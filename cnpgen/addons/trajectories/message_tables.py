@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cnpgen.addons.trajectories.trajectory_table import TrajectoryTable
+from cnpgen.arrays import JsonMapping
 from cnpgen.errors import UsageError
 from cnpgen.store.files.accounted import (
     Account,
@@ -98,14 +99,6 @@ def tables_of_document(
     return [replace(table, unused=unused) for table in tables]
 
 
-def states_table(
-    messages: Sequence[Any], place: str, allow_unused: Sequence[str] = ()
-) -> TrajectoryTable:
-    """Return one trajectory of a stream of ``sensor_msgs/JointState``; errors as of ``tables_of_document``."""
-    (table,) = tables_of_document(list(messages), place, allow_unused)
-    return table
-
-
 def _tables(document: Any, place: str) -> Iterator[TrajectoryTable]:
     """Yield the trajectories of a part of a document."""
     if (
@@ -137,7 +130,7 @@ def _tables(document: Any, place: str) -> Iterator[TrajectoryTable]:
         raise UsageError(f"{place}: expected {expected}, got {_kind(document)}")
 
 
-def _table_of_columns(document: Mapping[str, Any], place: str) -> TrajectoryTable:
+def _table_of_columns(document: JsonMapping, place: str) -> TrajectoryTable:
     """Return the table of an object of columns; single values are columns, too."""
     columns = {}
     for key, values in document.items():
@@ -151,7 +144,7 @@ def _table_of_columns(document: Mapping[str, Any], place: str) -> TrajectoryTabl
     return TrajectoryTable(place, columns, tuple(names or ()))
 
 
-def _check_message(message: Mapping[str, Any], place: str) -> None:
+def _check_message(message: JsonMapping, place: str) -> None:
     """Refuse motions of a base, attached objects, and responses of requests that failed."""
     for name in _OTHER_POINTS:
         other = message.get(name)
@@ -186,7 +179,8 @@ def _table_of_states(messages: Sequence[Any], place: str) -> TrajectoryTable:
     counted from the first.
     """
     names: list[str] = []
-    stamps, columns = [], {name: list[Values]() for name in _STATE_FIELDS.values()}
+    stamps = []
+    columns: dict[str, list[Any]] = {}
     for index, message in enumerate(messages):
         where = f"{place}: [{index}]"
         if not is_joint_state(message):
@@ -198,33 +192,55 @@ def _table_of_states(messages: Sequence[Any], place: str) -> TrajectoryTable:
             raise UsageError(
                 f"{where}: joint {other!r} is not in every message; the first has {', '.join(names)}"
             )
-        # The order of joints may differ between messages.
-        rows = [order.index(name) for name in names]
         header = message.get("header")
         stamp = header.get("stamp") if isinstance(header, dict) else None
         stamps.append(_seconds(stamp, f"{where}.header.stamp"))
-        for key, column in _STATE_FIELDS.items():
-            values = message.get(key) or []
-            if column != "q" and not values and not columns[column]:
-                continue
-            if not isinstance(values, list) or len(values) != len(names):
-                raise UsageError(
-                    f"{where}.{key} must have {len(names)} values, one per joint"
-                )
-            columns[column].append(_array(values, f"{where}.{key}")[rows])
+        # The order of joints may differ between messages.
+        rows = [order.index(name) for name in names]
+        _append(columns, message, _STATE_FIELDS, rows, where)
     # Differences of fractions are exact before they become float64.
     t = np.array([float(stamp - stamps[0]) for stamp in stamps])
     if len(t) > 1 and not t.any():
         raise UsageError(f"{place}: all stamps are equal: the messages have no times")
-    found = {MESSAGE_TIME: t} | {
-        name: np.stack(rows) for name, rows in columns.items() if rows
-    }
-    if len(found.get("dq", t)) != len(t):
-        raise UsageError(f"{place}: some messages have velocities and others not")
-    return TrajectoryTable(place, found, tuple(names))
+    return _table_of_points(t, columns, names, place)
 
 
-def _from_rows(rows: Sequence[Mapping[str, Any]], place: str) -> dict[str, Values]:
+def _append(
+    columns: dict[str, list[Any]],
+    point: JsonMapping,
+    fields: Mapping[str, str],
+    rows: Sequence[int],
+    where: str,
+) -> None:
+    """Append the values of a point, field -> column, in an order of the joints; derivatives may be empty lists."""
+    for key, name in fields.items():
+        values = point.get(key) or []
+        if not values and name != "q" and name not in columns:
+            continue
+        if not isinstance(values, list) or len(values) != len(rows):
+            count = len(values) if isinstance(values, list) else repr(values)[:60]
+            raise UsageError(
+                f"{where}.{key} must have {len(rows)} values, one per joint, got {count}"
+            )
+        mark_read(values)
+        columns.setdefault(name, []).append([values[row] for row in rows])
+
+
+def _table_of_points(
+    t: Values, columns: Mapping[str, list[Any]], names: Sequence[str], place: str
+) -> TrajectoryTable:
+    """Return the table of points at times [s], all of which have the same derivatives."""
+    for name, rows in columns.items():
+        # A derivative that begins at a later point leaves earlier rows empty.
+        if len(rows) != len(t):
+            raise UsageError(
+                f"{place}: {len(t) - len(rows)} of {len(t)} points have no {name}, and others do"
+            )
+    found = {name: _array(rows, f"{place}: {name}") for name, rows in columns.items()}
+    return TrajectoryTable(place, {MESSAGE_TIME: t, **found}, tuple(names))
+
+
+def _from_rows(rows: Sequence[JsonMapping], place: str) -> dict[str, Values]:
     """Return the columns of a list of objects with the same keys."""
     for index, row in enumerate(rows):
         if row.keys() != rows[0].keys():
@@ -250,7 +266,7 @@ def _array(values: Any, place: str) -> Values:
     return found
 
 
-def _from_message(message: Mapping[str, Any], place: str) -> TrajectoryTable:
+def _from_message(message: JsonMapping, place: str) -> TrajectoryTable:
     """Return the points of a ``trajectory_msgs/JointTrajectory``, of ROS 1 or 2."""
     points = message["points"]
     names = _names(message.get("joint_names"), f"{place}: joint_names")
@@ -258,33 +274,16 @@ def _from_message(message: Mapping[str, Any], place: str) -> TrajectoryTable:
         raise UsageError(
             f"{place}: points must be a list of points, got {points!r:.60}"
         )
-    columns: dict[str, list[Any]] = {MESSAGE_TIME: []}
+    times = []
+    columns: dict[str, list[Any]] = {}
     for index, point in enumerate(points):
         where = f"{place}: points[{index}]"
         if not isinstance(point, dict):
             raise UsageError(f"{where} must be an object, got {point!r:.60}")
         stamp = _seconds(point.get("time_from_start"), f"{where}.time_from_start")
-        columns[MESSAGE_TIME].append(float(stamp))
-        for key, name in _POINT_FIELDS.items():
-            values = point.get(key) or []
-            # Optional derivatives may be empty lists.
-            if not values and name != "q" and not columns.get(name):
-                continue
-            if not isinstance(values, list) or len(values) != len(names):
-                count = len(values) if isinstance(values, list) else repr(values)[:60]
-                raise UsageError(
-                    f"{where}.{key} must have {len(names)} values, one per joint, got {count}"
-                )
-            # A derivative that begins at a later point leaves earlier rows empty.
-            if len(columns.setdefault(name, [])) != index:
-                raise UsageError(f"{where}.{key}: earlier points have none")
-            mark_read(values)
-            columns[name].append(values)
-    return TrajectoryTable(
-        place,
-        {name: _array(rows, f"{place}: {name}") for name, rows in columns.items()},
-        tuple(names),
-    )
+        times.append(float(stamp))
+        _append(columns, point, _POINT_FIELDS, range(len(names)), where)
+    return _table_of_points(np.array(times), columns, names, place)
 
 
 def _kind(document: Any) -> str:

@@ -11,6 +11,7 @@ from cnpgen.addons.trajectories.array_tables import with_units
 from cnpgen.addons.trajectories.load_options import LoadOptions
 from cnpgen.addons.trajectories.text_tables import text_array
 from cnpgen.addons.trajectories.trajectory_table import TrajectoryTable, Values
+from cnpgen.arrays import JsonObject
 from cnpgen.errors import UsageError, requires_extra
 from cnpgen.plans.format import JOINT_NAMES_KEY, PLAN_COLUMN
 from cnpgen.plans.stated_units import UNIT_ATTRIBUTES
@@ -51,7 +52,7 @@ def read_parquet_tables(path: Path, _: LoadOptions) -> Iterator[TrajectoryTable]
     yield TrajectoryTable(str(path), columns)
 
 
-def _parquet_metadata(table: Any, key: bytes, path: Path) -> dict[str, Any]:
+def _parquet_metadata(table: Any, key: bytes, path: Path) -> JsonObject:
     """Return an object in the metadata of a table; empty without it."""
     try:
         found = json.loads((table.schema.metadata or {}).get(key, b"{}"))

@@ -11,6 +11,7 @@ from itertools import product
 
 import numpy as np
 
+from cnpgen.addons.trajectories.curve_family import ORDERS
 from cnpgen.addons.trajectories.lower_bounds import (
     MeanDerivatives,
     first_derivatives,
@@ -29,7 +30,6 @@ MIN_VIOLATION = 1.001  # in tolerances: rounding of the bounds proves nothing
 POSITIONS = "positions"
 VELOCITIES = "velocities"
 BOTH = "positions and velocities"
-_ORDERS = ("q", "dq", "ddq", "jerk")
 
 
 @dataclass(frozen=True)
@@ -70,7 +70,7 @@ def refuted_limits(
     # Bounds of quantities without a limit need not be computed.
     bounded = [quantity_of(constraint) for constraint in limits.constraints]
     for order, samples, condition, all_bounds in _bounds(trajectory, errors, largest):
-        name = _ORDERS[order]
+        name = ORDERS[order]
         # Bounds are computed one distance after the other, and only those of a limit.
         for bounds, limit in product(
             all_bounds if name in bounded else (),
@@ -85,17 +85,27 @@ def refuted_limits(
 
 def largest_values(limits: ProvenJointLimits) -> dict[str, Array]:
     """Return the largest absolute values within the limits and tolerances, by quantity, shape (n,) each; inf without."""
+    # The larger side counts: the values bound how far a motion within limits can move.
+    return absolute_limits(limits, np.maximum, 1.0)
+
+
+def absolute_limits(
+    limits: ProvenJointLimits, of_both: np.ufunc, tolerance_share: float
+) -> dict[str, Array]:
+    """Return one limit of absolute values for both signs, with a share of its tolerance, by quantity, shape (n,) each.
+
+    ``of_both`` chooses between the limits of both signs. Quantities without a limit
+    have inf.
+    """
     n = len(limits.joints)
-    largest = {order: np.full(n, np.inf) for order in _ORDERS}
+    smallest = {order: np.full(n, np.inf) for order in ORDERS}
     for constraint, bounds, tolerance in zip(
         limits.constraints, limits.bounds, limits.tolerance, strict=True
     ):
         name = quantity_of(constraint)
-        # The larger side counts: the values bound how far a motion within limits can
-        # move.
-        allowed = np.maximum(-bounds[:n], bounds[n:]) + tolerance
-        largest[name] = np.minimum(largest[name], allowed)
-    return largest
+        allowed = of_both(-bounds[:n], bounds[n:]) + tolerance_share * tolerance
+        smallest[name] = np.minimum(smallest[name], allowed)
+    return smallest
 
 
 def _worst(

@@ -17,10 +17,9 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from cnpgen.addons.trajectories.refuted_limits import RefutedLimit
-from cnpgen.arrays import Array
+from cnpgen.arrays import Array, Indices, Names
 from cnpgen.judges.plans.verdict import Margin
 
 Torques = Callable[[Array, Array, Array], Array]  # of states, shape (K, n) each
@@ -51,7 +50,7 @@ def refuted_torques(
     *,
     error: float,
     largest: tuple[Array, Array],
-    joint_names: tuple[str, ...],
+    joint_names: Names,
 ) -> RefutedLimit | None:
     """Return the torque limit that samples exceed most, or None.
 
@@ -96,7 +95,7 @@ def refuted_torques(
 
 def _refuted(  # noqa: PLR0917 - the parts of a margin
     allowed: TorqueLimit,
-    joint_names: tuple[str, ...],
+    joint_names: Names,
     joint: int,
     value: float,
     time: float,
@@ -119,7 +118,7 @@ def _refuted(  # noqa: PLR0917 - the parts of a margin
     return RefutedLimit(margin, "positions", UNLESS)
 
 
-def _centres(t: Array, lag: int) -> NDArray[np.intp]:
+def _centres(t: Array, lag: int) -> Indices:
     """Return the samples at the center of two spans of about equal lengths."""
     # The remainder holds for a hat with equal halves.
     centres = np.arange(lag, len(t) - lag)
@@ -130,7 +129,7 @@ def _centres(t: Array, lag: int) -> NDArray[np.intp]:
 
 
 def _mean_states(
-    t: Array, q: Array, centres: NDArray[np.intp], lag: int
+    t: Array, q: Array, centres: Indices, lag: int
 ) -> tuple[Array, Array, Array]:
     """Return positions at the center, mean velocities and mean accelerations over hats, shape (M, n) each."""
     # Divided differences: v_c = (q_2 - q_0) / (2 h), a = 2 (v_after - v_before) / (2

@@ -9,10 +9,10 @@ from typing import Any
 
 import numpy as np
 
+from cnpgen.addons.trajectories.samples import checked_samples
 from cnpgen.arrays import Array
 from cnpgen.errors import UsageError
 from cnpgen.schema.arguments import numbers
-from cnpgen.trajectory.samples import checked_samples
 
 
 @dataclass(frozen=True, eq=False)

@@ -9,6 +9,7 @@ samples.
 """
 
 import ctypes
+from collections.abc import Sequence
 from dataclasses import dataclass
 from math import factorial
 from typing import Any
@@ -56,49 +57,41 @@ def smooth_curve(
 
     Given accelerations are those of the curve at the samples.
     """
-    t = trajectory.t
-    q = trajectory.q
-    dq = trajectory.dq
+    t, q, dq, ddq = trajectory.t, trajectory.q, trajectory.dq, trajectory.ddq
     if dq is None or len(t) < 2 * END_SPANS + 2:
         return None
-    ddq = trajectory.ddq
     inner, jerks = (
         estimated_derivative(trajectory, order, NEIGHBORS) for order in (2, 3)
     )
-    inner = inner if ddq is None else ddq
-    ends = []
+    samples = [t, q, dq, inner if ddq is None else ddq, jerks]
     # The end is the start of the reversed motion.
-    for sign in (1.0, -1.0):
-        flip = slice(None, None, int(sign))
-        reversed_t = t if sign > 0 else t[-1] - t[::-1]
-        # A reversed time changes the sign of the odd derivatives, velocity and jerk.
-        samples = [
-            reversed_t,
-            q[flip],
-            sign * dq[flip],
-            inner[flip],
-            sign * jerks[flip],
-        ]
-        end = _end(
-            *(values[: END_SPANS + 1] for values in samples),
+    first, last = (
+        _end(
+            *(values[: END_SPANS + 1] for values in each),
             limits=limits,
             given=ddq is not None,
         )
-        if end is None:
-            return None
-        ends.append(end)
-    first, last = ends
-    # The reversed end returns to the time of the motion: t = T - tau, and dq changes
-    # its sign.
-    mirrored = [t[-1] - last[0][::-1], last[1][::-1], -last[2][::-1], last[3][::-1]]
-    inner_samples = slice(END_SPANS + 1, len(t) - END_SPANS - 1)
+        for each in (samples, _reversed(samples, t[-1]))
+    )
+    if first is None or last is None:
+        return None
+    between = slice(END_SPANS + 1, len(t) - END_SPANS - 1)
     parts = [
-        np.concatenate([start, values[inner_samples], end])
-        for start, values, end in zip(first, (t, q, dq, inner), mirrored, strict=True)
+        np.concatenate([start, values[between], end])
+        for start, values, end in zip(
+            first, samples, _reversed(last, t[-1]), strict=False
+        )
     ]
     # Knots closer than the rounding of times would enclose a span without length.
     kept = np.diff(parts[0], prepend=-1.0) > MIN_STEP_S
     return family_of_data(parts[0][kept], [values[kept] for values in parts[1:]])
+
+
+def _reversed(samples: Sequence[Array], duration: float) -> list[Array]:
+    """Return times, positions and derivatives in the order of reversed time, t' = T - t."""
+    t, *values = (each[::-1] for each in samples)
+    # A reversed time changes the sign of the odd derivatives, velocity and jerk.
+    return [duration - t, *((-1) ** order * each for order, each in enumerate(values))]
 
 
 def estimated_derivative(trajectory: Trajectory, order: int, neighbors: int) -> Array:

@@ -40,7 +40,7 @@ def joint_columns(
     Raises:
         ValueError: Columns of some joints are missing, or numbers are ambiguous.
     """
-    named = [_column_of(keys, joint.lower(), kind) for joint in joints]
+    named = [column_of(keys, joint, kind) for joint in joints]
     if all(named):
         return [name for name in named if name]
     if any(named):
@@ -49,7 +49,7 @@ def joint_columns(
     if any(joint.isdecimal() for joint in joints):
         return None
     numbered = [
-        [_column_of(keys, str(k + first), kind) for k in range(len(joints))]
+        [column_of(keys, str(k + first), kind) for k in range(len(joints))]
         for first in (0, 1)
     ]
     complete = [found for found in numbered if all(found)]
@@ -71,12 +71,12 @@ def joint_columns(
     return None
 
 
-def _column_of(keys: Mapping[str, str], joint: str, kind: str) -> str | None:
+def column_of(keys: Mapping[str, str], joint: str, kind: str) -> str | None:
     """Return the column of a joint and a kind, such as ``"q joint_1 [rad]"`` or ``"joint_1_position"``.
 
     Positions may have the joint's name alone.
     """
-    joint = _INDEX.sub(r"_\1", joint)
+    joint = _INDEX.sub(r"_\1", joint.lower())
     if kind == "q" and joint in keys and not joint.isdecimal():
         return keys[joint]
     for word in KIND_NAMES[kind]:

@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 
+from cnpgen.addons.trajectories.load_options import LoadOptions
 from cnpgen.addons.trajectories.sampled_trajectory import Trajectory
 from cnpgen.addons.trajectories.table_columns import (
     KIND_NAMES,
     TIME_NAMES,
+    column_of,
     is_number,
     joint_columns,
     key_of,
@@ -27,7 +29,7 @@ from cnpgen.addons.trajectories.trajectory_table import (
     MAX_RATE_DEVIATION,
     TrajectoryTable,
 )
-from cnpgen.arrays import Array
+from cnpgen.arrays import Array, NamedNumbers
 from cnpgen.errors import UsageError, listed, nearest
 from cnpgen.plans.format import PHASE_COLUMN
 from cnpgen.problems.problem_record import ProblemRecord
@@ -39,26 +41,11 @@ MAX_HELD_DIFFERENCE = 1e-9  # rad or m, of joints that are not planned
 MAX_LISTED = 12  # columns in messages
 
 
-@dataclass(frozen=True, kw_only=True)
-class ReadOptions:
-    """Options of ``load_trajectories``; the joints have one name in the file for each of the problem."""
-
-    joints: tuple[str, ...]
-    velocities: tuple[str, ...] = ()
-    time: str | None = None
-    degrees: bool = False
-    rate: float | None = None
-    unwrap: bool = False
-    drop_repeats: bool = False
-    extrapolate: bool = False
-    separated: bool = False  # into parts of a file
-    parameters: Mapping[str, float] = field(default_factory=dict)
-
-
 @dataclass
 class TableReader:
     """Reader of one trajectory of a table.
 
+    The joints, and columns with their velocities, have one name in the file for each of the problem.
     ``used`` has the names of the columns that were read, ``notes`` sentences about how,
     ``other_joints`` the joints of arrays that the problem does not plan, ``lacks_unit`` whether a column of
     revolute joints states no unit.
@@ -66,7 +53,10 @@ class TableReader:
 
     table: TrajectoryTable
     record: ProblemRecord
-    options: ReadOptions
+    options: LoadOptions
+    joints: Sequence[str]
+    velocities: Sequence[str]
+    parameters: NamedNumbers
     velocity_limit: Array
     used: set[str] = field(default_factory=set)
     notes: list[str] = field(default_factory=list)
@@ -91,19 +81,13 @@ class TableReader:
             if PHASE_COLUMN in self.table.columns
             else None
         )
-        rows: dict[str, Any] = {
-            "t": t,
-            "q": q,
-            "dq": columns["dq"],
-            "ddq": columns["ddq"],
-        }
-        rows["phase"] = phase
+        rows: dict[str, Any] = {"t": t, **columns, "phase": phase}
         if self.options.drop_repeats:
             rows = self._without_repeats(rows)
         if self.options.unwrap:
             turning = [not sliding for sliding in self.record.prismatic_joints]
             rows["q"][:, turning] = np.unwrap(rows["q"][:, turning], axis=0)
-        if rows["t"][0] > 0 and not self.options.separated:
+        if rows["t"][0] > 0 and self.options.separate_by is None:
             self.notes.append(
                 f"{self.table.place} begins at t = {rows['t'][0]:.6g} s: the motion before its first sample is not known"
             )
@@ -130,7 +114,7 @@ class TableReader:
         unknown = self.options.rate is None and time is not None
         stated = not unknown or self._stated(time or "") is not None
         if not stated:
-            angle = "deg" if self.options.degrees else "rad"
+            angle = self.options.unit or "rad"
             self.notes.append(
                 f"columns without a unit are read in s, {angle} and m, and their derivatives"
             )
@@ -194,12 +178,11 @@ class TableReader:
 
     def _check_numbered(self) -> None:
         """Check that columns without names are those of times and joints, or named by options."""
-        options = self.options
         width = len(self.table.columns)
-        if all(joint.isdecimal() for joint in options.joints):
-            return
-        n = len(options.joints)
-        if width == n + (options.rate is None):
+        n = len(self.joints)
+        if all(joint.isdecimal() for joint in self.joints) or (
+            width == n + (self.options.rate is None)
+        ):
             return
         raise self._error(
             f"{width} columns without a head, expected {n + 1} of times and joints:"
@@ -211,7 +194,7 @@ class TableReader:
         """Return the values of the problem's parameters, shape (p,)."""
         ranges = self.record.parameters
         columns = {plain(name): name for name in self.table.columns}
-        found = dict(self.options.parameters)
+        found = dict(self.parameters)
         for parameter, unit in zip(ranges.names, ranges.value_units, strict=True):
             if (name := columns.get(parameter)) is None:
                 continue
@@ -250,7 +233,7 @@ class TableReader:
         if rate is not None and (
             name is None or not self._has_times_of_rate(name, rate)
         ):
-            return np.asarray(np.arange(count) / rate)
+            return np.arange(count) / rate
         if name is not None:
             return self._seconds(name)
         text = f"no column of times ({', '.join(TIME_NAMES)})"
@@ -334,28 +317,26 @@ class TableReader:
 
     def _kind(self, kind: str) -> Array | None:
         """Return positions, velocities or accelerations of the problem's joints, shape (K, n), or None."""
-        if kind == "dq" and self.options.velocities:
-            stated = self.options.velocities
-            return self._stacked(
-                [self._named_column(name, "velocities") for name in stated], kind
-            )
+        if kind == "dq" and self.velocities:
+            names = [self._named_column(name, "velocities") for name in self.velocities]
+            return self._stacked(names, kind)
         for word in KIND_NAMES[kind]:
             for name, values in self.table.columns.items():
                 if plain(name).lower() == word and values.ndim == 2:
                     return self._selected(name) * self._factors(
-                        [name] * len(self.options.joints), kind
+                        [name] * len(self.joints), kind
                     )
-        names = self._scalar_columns(kind)
-        return None if names is None else self._stacked(names, kind)
+        found = self._scalar_columns(kind)
+        return None if found is None else self._stacked(found, kind)
 
     def _stacked(self, names: list[str], kind: str) -> Array:
         columns = np.stack([self._numbers(name, ndim=1) for name in names], axis=1)
-        return np.asarray(columns * self._factors(names, kind))
+        return columns * self._factors(names, kind)
 
     def _selected(self, name: str) -> Array:
         """Return the problem's joints of an array with one column per joint."""
         values = self._numbers(name, ndim=2)
-        joints = self.options.joints
+        joints = self.joints
         width = values.shape[1]
         named = self.table.joint_names
         if named and len(named) != width:
@@ -378,11 +359,24 @@ class TableReader:
             raise self._error(
                 f"{name} has {width} columns, the problem plans {len(joints)} joints"
             )
+        self._note_order(f"the columns of {name}")
         return values
+
+    def _note_order(self, columns: str) -> None:
+        """Note that columns without names of joints are read in the problem's order."""
+        names = self.record.joint_names
+        if self.joints != names:
+            raise self._error(
+                f"{columns} have no names of joints: {{joints}} must give their numbers",
+                remedies={"joints": None},
+            )
+        self.notes.append(
+            f"columns without names of joints are read in the problem's order: {', '.join(names)}"
+        )
 
     def _scalar_columns(self, kind: str) -> list[str] | None:
         """Return the column of every joint, or None without any."""
-        joints = self.options.joints
+        joints = self.joints
         table = self.table
         if not table.has_head:
             if kind != "q":
@@ -390,6 +384,7 @@ class TableReader:
             if all(joint.isdecimal() for joint in joints):
                 return [self._named_column(joint, "joints") for joint in joints]
             first = int(self.options.rate is None)
+            self._note_order("columns without a head")
             return [str(k + first) for k in range(len(joints))]
         keys = {
             key_of(name): name
@@ -397,9 +392,12 @@ class TableReader:
             if values.ndim == 1
         }
         try:
-            return joint_columns(keys, joints, kind)
+            names = joint_columns(keys, joints, kind)
         except ValueError as error:
             raise self._error(str(error)) from error
+        if names and column_of(keys, joints[0], kind) is None:
+            self._note_order(f"the columns {names[0]!r} to {names[-1]!r}")
+        return names
 
     def _has_unit(self, kind: str) -> bool:
         """Return whether a column of a kind states its unit."""
@@ -437,7 +435,7 @@ class TableReader:
     def _factors(self, names: Sequence[str], kind: str) -> Array:
         """Return the factors to SI units of the columns of a kind, one per joint, shape (n,)."""
         exponent = {"q": "", "dq": "/s", "ddq": "/s^2"}[kind]
-        turning = ("rad", DEGREE if self.options.degrees else 1.0)
+        turning = ("rad", DEGREE if self.options.unit == "deg" else 1.0)
         units = [
             ("m", 1.0) if slides else turning for slides in self.record.prismatic_joints
         ]
@@ -464,7 +462,7 @@ class TableReader:
 
     def _missing(self) -> str:
         """Return the message for missing positions."""
-        joint = self.options.joints[0]
+        joint = self.joints[0]
         columns = ", ".join(list(self.table.columns)[:12])
         expected = f"q {joint}, {joint}_position, {joint} and so on, or an array q"
         return f"no columns with joint positions, expected {expected}; there are {columns or 'no columns'}"

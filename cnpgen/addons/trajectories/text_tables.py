@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
+from cnpgen.addons.trajectories.table_columns import is_number
 from cnpgen.addons.trajectories.trajectory_table import TrajectoryTable, Values
 from cnpgen.errors import UsageError
 from cnpgen.store.files.size_limits import (
@@ -43,7 +44,7 @@ def read_text_table(path: Path, separator: str | None) -> TrajectoryTable:
     separator = separator or _separator_of(lines[0][1])
     rows = _cells(path, lines, separator)
     head = None
-    if not all(map(_is_number, rows[0][1])):
+    if not all(map(is_number, rows[0][1])):
         head = rows[0][1]
         rows = rows[1:]
     elif comment is not None:
@@ -137,11 +138,3 @@ def text_array(texts: Sequence[str]) -> Values:
             f"a column of {len(texts):,} texts has one of {longest:,} characters"
         )
     return np.array(texts, np.str_)
-
-
-def _is_number(cell: str) -> bool:
-    try:
-        float(cell)
-    except ValueError:
-        return False
-    return True

@@ -7,6 +7,7 @@ from dataclasses import fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from cnpgen.arrays import Names, TextRows
 from cnpgen.cli import recipe_names, values
 from cnpgen.cli.parser import Options, options_of
 from cnpgen.cli.terminal import table
@@ -170,7 +171,7 @@ def load_file(
 def write_json(
     file: Path, loaded: "LoadedTrajectories", found: "TrajectoryEvaluation"
 ) -> None:
-    """Write all verdicts, and what was not used of the file, as JSON."""
+    """Write all verdicts, what was not used of the file, and the notes of its reading, as JSON."""
     rows = [
         {"trajectory": index, "place": label, **verdict.to_dict()}
         for index, (label, verdict) in enumerate(
@@ -180,6 +181,7 @@ def write_json(
     document = {
         "file": str(file),
         "unused": list(loaded.ignored),
+        "notes": list(loaded.notes),
         **found.summary(),
         "verdicts": rows,
     }
@@ -219,7 +221,7 @@ def _condition_tables(
     found: "TrajectoryEvaluation", conditions: dict[str, dict[str, int]]
 ) -> list[str]:
     """Return the table of decisions about conditions, and that of their worst margins."""
-    decided: list[tuple[str, ...]] = [
+    decided: TextRows = [
         (
             "condition",
             "valid",
@@ -262,7 +264,7 @@ def _largest(shares: list[float | None]) -> str:
     return f"{max(known):.1%}" if known else "-"
 
 
-def listing_text(found: "TrajectoryEvaluation", labels: tuple[str, ...]) -> str:
+def listing_text(found: "TrajectoryEvaluation", labels: Names) -> str:
     """Return one line for each trajectory, with those that are not valid first."""
     order = sorted(range(len(labels)), key=lambda index: found.verdicts[index].valid)
     return "\n".join(

@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 
 from cnpgen.addons.trajectories.sampled_trajectory import Trajectory
-from cnpgen.arrays import Array
+from cnpgen.arrays import AnyPath, Array
 from cnpgen.errors import UsageError, counted, listed
 from cnpgen.make.recipe import load_dataset_recipe
 from cnpgen.plans.format import PlanStatus
@@ -117,7 +117,7 @@ def with_scenes(
 
 
 def plans_in_scenes(
-    plans: Plans, scenes: str | Path, allow_unused: Sequence[str] = ()
+    plans: Plans, scenes: AnyPath, allow_unused: Sequence[str] = ()
 ) -> Plans:
     """Place the obstacles of scenes around plans that have none: one scene for each, or one for all.
 

@@ -8,6 +8,8 @@ from typing import Any
 
 from numpy.typing import NDArray
 
+from cnpgen.arrays import NamedNumbers, Names
+
 Values = NDArray[Any]
 
 # Of a stated rate from that of the file's times, relative.
@@ -34,8 +36,8 @@ class TrajectoryTable:
 
     place: str
     columns: Mapping[str, Values]
-    joint_names: tuple[str, ...] = ()
+    joint_names: Names = ()
     lines: tuple[int, ...] = ()
     has_head: bool = True
-    unused: tuple[str, ...] = ()
-    held_joints: Mapping[str, float] = field(default_factory=dict)
+    unused: Names = ()
+    held_joints: NamedNumbers = field(default_factory=dict)

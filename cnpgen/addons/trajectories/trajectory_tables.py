@@ -14,7 +14,6 @@ from cnpgen.addons.trajectories.lerobot_tables import LEROBOT_INFO, read_lerobot
 from cnpgen.addons.trajectories.load_options import DEFAULT_OPTIONS, LoadOptions
 from cnpgen.addons.trajectories.message_tables import (
     is_joint_state,
-    states_table,
     tables_of_document,
 )
 from cnpgen.addons.trajectories.parquet_tables import read_parquet_tables
@@ -161,7 +160,8 @@ def _read_yaml(path: Path, options: LoadOptions) -> Iterator[TrajectoryTable]:
     documents = read_yaml(path, numbers=True)
     states = [document for document in documents if document is not None]
     if states and is_joint_state(states[0]):
-        yield states_table(states, str(path), options.allow_unused)
+        # A stream of states is one trajectory.
+        yield from tables_of_document(states, str(path), options.allow_unused)
         return
     for index, document in enumerate(documents):
         if document is not None:

@@ -11,8 +11,8 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from enum import StrEnum
-from typing import Any
 
+from cnpgen.arrays import JsonObject
 from cnpgen.judges.plans.verdict import Margin
 
 # An error this large, in SI units, is that of a missing derivative.
@@ -72,7 +72,7 @@ class ConditionDecision:
         """Whether the margin has a value: not if the curve lacks the derivative that it needs."""
         return self.decision != Decision.UNDECIDED or self.uncertainty < DECIDING_ERROR
 
-    def to_dict(self) -> dict[str, Any]:
+    def to_dict(self) -> JsonObject:
         """Return the decision for JSON; values that were not measured are None."""
         margin = self.margin.to_dict()
         known = self.is_measured
@@ -146,7 +146,7 @@ class TrajectoryVerdict:
             deciding, key=lambda name: deciding[name].margin.severity, default=""
         )
 
-    def to_dict(self) -> dict[str, Any]:
+    def to_dict(self) -> JsonObject:
         """Return the verdict for JSON."""
         return {
             "decision": str(self.decision),

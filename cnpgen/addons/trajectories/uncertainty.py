@@ -10,10 +10,9 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from cnpgen.addons.trajectories.curve_family import UNDEFINED, CurveFamily
-from cnpgen.arrays import Array
+from cnpgen.arrays import Array, Indices
 from cnpgen.judges.plans.continuous_collision import is_contact
 from cnpgen.judges.plans.evaluated_trajectory import EvaluatedTrajectory
 from cnpgen.judges.plans.measure import MeasuredCondition, measure
@@ -109,7 +108,7 @@ def _friction_changes(
     world: PathWorld,
     condition: MeasuredCondition,
     s: Array,
-    starts: NDArray[np.intp],
+    starts: Indices,
 ) -> Array | float:
     """Bound the changes of the friction of drives in every block, shape (m, B); 0 for other conditions.
 
@@ -135,7 +134,7 @@ def _friction_changes(
     # Friction enters the power times the velocity.
     if condition.condition.unit == POWER_UNIT:
         changes = [change * (np.abs(dq) + error)[joints] for change in changes]
-    return np.asarray(np.maximum.reduceat(np.max(changes, axis=0), starts, axis=1))
+    return np.maximum.reduceat(np.max(changes, axis=0), starts, axis=1)
 
 
 def _changes(  # noqa: PLR0917 - as of uncertainty_of
@@ -145,7 +144,7 @@ def _changes(  # noqa: PLR0917 - as of uncertainty_of
     scenes: Sequence[Array],
     smooth: Sequence[MeasuredCondition],
     s: Array,
-    starts: NDArray[np.intp],
+    starts: Indices,
 ) -> list[Array]:
     """Bound the errors of smooth conditions in every block, shape (m, B) each."""
     # The middle of every block.
@@ -174,7 +173,8 @@ def _changes(  # noqa: PLR0917 - as of uncertainty_of
         offsets = [bound * random.choice([-1.0, 1.0], bound.shape) for bound in bounds]
         # Effects of several values may exceed the sum of single ones where they
         # interact.
-        _raise_to(total, changes(offsets))
+        for row, change in zip(total, changes(offsets), strict=True):
+            np.maximum(row, change, out=row)
     return [
         CURVATURE_FACTOR * np.where(np.isfinite(row), row, UNDEFINED) for row in total
     ]
@@ -224,9 +224,3 @@ def _add_scene_changes(
     if changes:
         for row, *of_scenes in zip(total, *changes, strict=True):
             np.add(row, SCENE_FACTOR * np.max(of_scenes, axis=0), out=row)
-
-
-def _raise_to(total: Sequence[Array], changes: Sequence[Array]) -> None:
-    """Replace totals by the changes that exceed them."""
-    for row, change in zip(total, changes, strict=True):
-        np.maximum(row, change, out=row)

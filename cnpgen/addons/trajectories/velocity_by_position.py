@@ -23,7 +23,7 @@ from cnpgen.addons.trajectories.lower_bounds import LAGS, first_derivatives
 from cnpgen.addons.trajectories.refuted_limits import RefutedLimit
 from cnpgen.addons.trajectories.sample_errors import SampleErrors
 from cnpgen.addons.trajectories.sampled_trajectory import Trajectory
-from cnpgen.arrays import Array
+from cnpgen.arrays import Array, Names
 from cnpgen.errors import RecipeError
 from cnpgen.judges.plans.verdict import Margin
 from cnpgen.problems.constraints.constraint import Condition, Constraint
@@ -153,7 +153,7 @@ class VelocityByPosition(Constraint):
         trajectory: Trajectory,
         errors: SampleErrors,
         largest: Array,
-        joints: tuple[str, ...],
+        joints: Names,
     ) -> RefutedLimit | None:
         """Return the limit that no curve through samples within their errors meets, or None.
 

@@ -7,17 +7,21 @@ differences from the samples plus a weight times the integral of the squared jer
 largest weight that keeps a joint within its errors is chosen for each joint.
 """
 
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
-from typing import Any, Protocol
+from functools import partial
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from cnpgen.addons.trajectories.curve_family import CurveFamily
 from cnpgen.addons.trajectories.interpolate import data_of, family_of_data
 from cnpgen.addons.trajectories.sample_errors import SampleErrors
 from cnpgen.addons.trajectories.sampled_trajectory import Trajectory
-from cnpgen.arrays import Array
+from cnpgen.arrays import Array, Mask
+
+if TYPE_CHECKING:
+    from scipy.interpolate import BSpline
 
 DEGREE = 5
 MIN_ERRORS = np.array([1e-9, 1e-7, 1e-5])  # of q, dq, ddq: agreement with exact samples
@@ -39,32 +43,12 @@ def witness(trajectory: Trajectory, errors: SampleErrors) -> CurveFamily | None:
     shares = (0.8, 0.0) if errors.t else (0.0,)
     for share in shares:
         fit = fitted(trajectory, errors, share)
-        if fit is not None and is_within(fit, trajectory, errors):
-            return family_of_data(trajectory.t, fit.at(trajectory.t))
+        if fit is None:
+            continue
+        at = partial(derivatives_of, fit)
+        if is_within(at, trajectory, errors):
+            return family_of_data(trajectory.t, at(trajectory.t))
     return None
-
-
-class SplinesOfJoints(Protocol):
-    """Splines of n joints."""
-
-    def at(self, t: Array) -> list[Array]:
-        """Return positions, velocities and accelerations, shape (K, n) each."""
-        ...
-
-
-@dataclass(frozen=True, eq=False)
-class _Splines:
-    """Splines of n joints with coefficients of shape (N, n)."""
-
-    knots: Array
-    coefficients: Array
-
-    def at(self, t: Array) -> list[Array]:
-        """Return positions, velocities and accelerations, shape (K, n) each."""
-        from scipy.interpolate import BSpline
-
-        spline = BSpline(self.knots, self.coefficients, DEGREE)
-        return [np.asarray(spline(t, order)) for order in range(3)]
 
 
 @dataclass(frozen=True, eq=False)
@@ -90,36 +74,31 @@ class _NormalEquations:
 
 def fitted(
     trajectory: Trajectory, errors: SampleErrors, jitter_share: float
-) -> _Splines | None:
-    """Return the splines with the largest weights whose differences are within the errors."""
+) -> "BSpline | None":
+    """Return the splines of all joints with the largest weights whose differences are within the errors."""
+    from scipy.interpolate import BSpline
+
     data = data_of(trajectory)
     t = trajectory.t
     allowed = np.maximum(errors.values, MIN_ERRORS)[: len(data)]
     # A value measured within d of its time differs by at most its rate times d.
-    rates = [np.abs(np.gradient(values, t, axis=0)) for values in data]
     limits = [
-        e + jitter_share * errors.t * rate
-        for e, rate in zip(allowed, rates, strict=True)
+        error + jitter_share * errors.t * np.abs(np.gradient(values, t, axis=0))
+        for error, values in zip(allowed, data, strict=True)
     ]
     equations = _equations(t, data, allowed)
     # Columns of joints without a solution stay nan.
     chosen = np.full((len(equations.right), trajectory.q.shape[1]), np.nan)
 
-    def keep(exponent: float, candidates: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    def keep(exponent: float, candidates: Mask) -> Mask:
         """Store the solutions of candidates within the errors, and return which these are."""
         solution = equations.solve(exponent)
         if solution is None or not np.isfinite(solution).all():
             return np.zeros_like(candidates)
-        found = _Splines(equations.knots, solution).at(t)
-        close = np.all(
-            [
-                (np.abs(value - given) <= limit).all(axis=0)
-                for value, given, limit in zip(found, data, limits, strict=False)
-            ],
-            axis=0,
-        )
-        chosen[:, close & candidates] = solution[:, close & candidates]
-        return np.asarray(close & candidates)
+        found = derivatives_of(BSpline(equations.knots, solution, DEGREE), t)
+        kept = _are_close(found, data, limits, axis=0) & candidates
+        chosen[:, kept] = solution[:, kept]
+        return kept
 
     at = np.full(chosen.shape[1], np.nan)  # exponents
     # Weights fall by powers of ten. The first one that keeps a joint within its errors
@@ -133,7 +112,12 @@ def fitted(
     # Half a power more is tried once; a joint that fails keeps its solution.
     for exponent in np.unique(at):
         keep(exponent + REFINED, at == exponent)
-    return _Splines(equations.knots, chosen)
+    return BSpline(equations.knots, chosen, DEGREE)
+
+
+def derivatives_of(spline: "BSpline", t: Array) -> list[Array]:
+    """Return positions, velocities and accelerations of a spline, shape (K, n) or (K,) each."""
+    return [np.asarray(spline(t, order)) for order in range(3)]
 
 
 def _equations(t: Array, data: list[Array], errors: Array) -> _NormalEquations:
@@ -203,21 +187,30 @@ def _bands(matrix: Any) -> Array:
 
 
 def is_within(
-    splines: "SplinesOfJoints", trajectory: Trajectory, errors: SampleErrors
+    at: Callable[[Array], list[Array]], trajectory: Trajectory, errors: SampleErrors
 ) -> bool:
-    """Return whether splines meet every sample within its errors at one time within the jitter."""
+    """Return whether a curve meets every sample within its errors at one time within the jitter.
+
+    ``at`` returns its positions, velocities and accelerations at times [s].
+    """
     t = trajectory.t
-    data = data_of(trajectory)
     # The relative share is for rounding in the evaluation of splines.
     allowed = np.maximum(errors.values, MIN_ERRORS) * (1 + 1e-9)
     met = np.zeros(len(t), bool)
     for offset in np.linspace(-1, 1, JITTER_PARTS if errors.t else 1):
         shift = offset * errors.t if errors.t else 0.0
         # All values of a sample must be met at one time, not each at its own.
-        values = splines.at(np.clip(t + shift, t[0], t[-1]))
-        close = [
-            (np.abs(value - given) <= limit).all(axis=1)
-            for value, given, limit in zip(values, data, allowed, strict=False)
-        ]
-        met |= np.all(close, axis=0)
+        values = at(np.clip(t + shift, t[0], t[-1]))
+        met |= _are_close(values, data_of(trajectory), allowed, axis=1)
     return bool(met.all())
+
+
+def _are_close(
+    values: Sequence[Array], data: Sequence[Array], limits: Iterable[Any], axis: int
+) -> Mask:
+    """Return whether all given data are within limits of values along an axis."""
+    close = [
+        (np.abs(value - given) <= limit).all(axis=axis)
+        for value, given, limit in zip(values, data, limits, strict=False)
+    ]
+    return np.asarray(np.all(close, axis=0))

@@ -13,10 +13,10 @@ from typing import Any
 from urllib.parse import parse_qs, urlsplit
 
 import numpy as np
-from numpy.typing import NDArray
 
 from cnpgen.addons.view.view_bodies import Body
 from cnpgen.addons.view.view_scene import View, ViewScene
+from cnpgen.arrays import AnyArray
 from cnpgen.errors import CnpgenError, MachineError, UsageError, requires_extra
 
 HOST = "127.0.0.1"
@@ -55,7 +55,7 @@ def _viewer() -> str:
         return path.read_text(encoding="utf-8")
 
 
-def _encoded(value: View | Body | NDArray[Any]) -> Any:
+def _encoded(value: View | Body | AnyArray) -> Any:
     """Return an object for JSON.
 
     Arrays as base64 of their bytes, with 4 bytes per number.

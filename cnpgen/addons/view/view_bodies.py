@@ -10,7 +10,7 @@ from xml.etree import ElementTree
 import numpy as np
 from numpy.typing import NDArray
 
-from cnpgen.arrays import Array
+from cnpgen.arrays import Array, JsonObject
 from cnpgen.errors import RecipeError
 from cnpgen.problems.problem import Problem
 from cnpgen.robots.chain import frame_of
@@ -80,7 +80,7 @@ def capsule_bodies(robot: Robot) -> list[Body]:
     ]
 
 
-def planned_joints(robot: Robot) -> tuple[list[dict[str, Any]], list[float]]:
+def planned_joints(robot: Robot) -> tuple[list[JsonObject], list[float]]:
     """Return the planned joints and the placement of the tip, by columns, from which the page computes poses."""
     import pinocchio as pin
 

@@ -27,7 +27,7 @@ from cnpgen.addons.trajectories.trajectory_options import (
 )
 from cnpgen.cli import recipe_names, values
 from cnpgen.cli.parser import Parser, refuse
-from cnpgen.errors import DatasetError, UsageError
+from cnpgen.errors import DatasetError, UsageError, counted
 
 if TYPE_CHECKING:
     from cnpgen.addons.view.view_scene import ViewScene
@@ -213,7 +213,7 @@ def _scene_of_trajectories(
     count = len(loaded.trajectories)
     if (row := max(rows)) >= count:
         raise UsageError(
-            f"{arguments.what} has no trajectory {row}: {count} are numbered from 0"
+            f"{arguments.what} has no trajectory {row}: {counted(count, 'trajectory')}, numbered from 0"
         )
     chosen = [loaded.trajectories[row] for row in rows]
     titles = [f"{problem.name}: {loaded.labels[row]}" for row in rows]
@@ -258,6 +258,6 @@ def _plans(arguments: argparse.Namespace, rows: Sequence[int]) -> "tuple[Plans, 
     option = "--rows" if arguments.rows else "--row"
     if (row := max(rows)) >= len(plans):
         raise UsageError(
-            f"{option}: {arguments.what} has no plan {row}: {len(plans)} plans are numbered from 0"
+            f"{option}: {arguments.what} has no plan {row}: {counted(len(plans), 'plan')}, numbered from 0"
         )
     return plans[list(rows)], len(plans)

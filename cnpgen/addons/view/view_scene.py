@@ -2,7 +2,6 @@
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 
@@ -18,7 +17,7 @@ from cnpgen.addons.view.view_bodies import (
     tube,
     wrapped,
 )
-from cnpgen.arrays import Array
+from cnpgen.arrays import Array, JsonObject, Names
 from cnpgen.judges.plans.condition_curves import (
     ConditionCurve,
     condition_curves,
@@ -70,10 +69,10 @@ class View:
     world: Sequence[Body]  # obstacles, the table and the puck
     path: Sequence[Body] = ()  # path of the tip, of a motion
     # Quantities with their shares of the limits; empty without a motion.
-    curves: Sequence[dict[str, Any]] = ()
+    curves: Sequence[JsonObject] = ()
     # Curves of the other conditions; empty without a motion.
-    conditions: Sequence[dict[str, Any]] = ()
-    verdict: dict[str, Any] | None = None  # None without a motion
+    conditions: Sequence[JsonObject] = ()
+    verdict: JsonObject | None = None  # None without a motion
 
 
 @dataclass(frozen=True)
@@ -82,7 +81,7 @@ class ViewScene:
 
     note: str  # remark about the bodies of the robot
     # Placements, axes and limits of the planned joints.
-    joints: Sequence[dict[str, Any]]
+    joints: Sequence[JsonObject]
     tip: Sequence[float]  # pose of the tip in the frame of the last joint, by columns
     joints_and_tip: int  # number of poses of a frame
     robot: Sequence[Body]
@@ -228,7 +227,7 @@ def _verdict(
     times: Array,
     poses: Array,
     joints: Sequence[str],
-) -> dict[str, Any]:
+) -> JsonObject:
     """Return a verdict for JSON, its margins located in time and space, the largest violation first.
 
     The poses of the joints, the universe first and the tip last, have shape (K, joints,
@@ -279,11 +278,11 @@ def _point(
     if curve is not None and curve.points is not None:
         return np.asarray(curve.points[frame].mean(axis=0))
     if margin.part in joints:
-        return np.asarray(poses[1 + list(joints).index(margin.part), :3, 3])
-    return np.asarray(poses[-1, :3, 3])
+        return poses[1 + list(joints).index(margin.part), :3, 3]
+    return poses[-1, :3, 3]
 
 
-def _condition(curve: ConditionCurve) -> dict[str, Any]:
+def _condition(curve: ConditionCurve) -> JsonObject:
     """Return a curve; bounds that do not exist are None."""
     return {
         "name": curve.label,
@@ -312,9 +311,9 @@ def _still(  # noqa: PLR0917 - all of them are shown
     robot: Robot,
     title: str,
     q: Array,
-    labels: tuple[str, ...],
+    labels: Names,
     scene: Scene,
-    verdict: dict[str, Any] | None = None,
+    verdict: JsonObject | None = None,
 ) -> View:
     """Show configurations without a motion."""
     times = [float(frame) for frame in range(len(labels))]
@@ -446,4 +445,4 @@ def _disc_corners(bottom: Array, radius: float, height: float) -> Array:
 
 
 def _corners(low: Array, high: Array) -> Array:
-    return np.asarray((low + high) / 2 + CUBE * (high - low))
+    return (low + high) / 2 + CUBE * (high - low)

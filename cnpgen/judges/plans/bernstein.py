@@ -166,7 +166,8 @@ def _to_bernstein_form(
     """
     rows = []
     for order in orders:
-        (knots, matrix), size = derivative_matrix(points, degree, order), degree - order
+        knots, matrix = derivative_matrix(points, degree, order)
+        size = degree - order
         for k, (low, high) in product(range(size + 1), pairwise(edges)):
             # The last knot before the middle of the interval: the polar form of its
             # span.

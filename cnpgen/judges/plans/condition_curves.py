@@ -5,9 +5,8 @@ from dataclasses import dataclass
 from typing import cast
 
 import numpy as np
-from numpy.typing import NDArray
 
-from cnpgen.arrays import Array
+from cnpgen.arrays import Array, Mask
 from cnpgen.judges.plans.joint_limits import is_proven
 from cnpgen.judges.plans.measure import MeasuredCondition, measure, name_part
 from cnpgen.problems.constraints.clearance import DistanceConstraint
@@ -46,7 +45,7 @@ class ConditionCurve:
     pairs: tuple[str, ...] = ()
 
     @property
-    def violated(self) -> NDArray[np.bool_]:
+    def violated(self) -> Mask:
         """Mask of the states at which a value is outside its bounds by more than the tolerance, shape (K,)."""
         outside = np.maximum(self.lower - self.values, self.values - self.upper)
         return np.asarray(~(outside <= self.tolerance).all(axis=0))
@@ -102,7 +101,8 @@ def _unit_of(condition: MeasuredCondition) -> tuple[float, str, float]:
 
 def _bounded_curve(condition: MeasuredCondition) -> ConditionCurve:
     """Convert one value with its bounds; an equality becomes the deviation from its value."""
-    stated, (factor, shown, tolerance) = condition.condition, _unit_of(condition)
+    stated = condition.condition
+    factor, shown, tolerance = _unit_of(condition)
     center = stated.lower[0] if stated.is_equality else 0.0
     return ConditionCurve(
         stated.name,
@@ -118,7 +118,8 @@ def _bounded_curve(condition: MeasuredCondition) -> ConditionCurve:
 
 def _distance_inside(problem: Problem, condition: MeasuredCondition) -> ConditionCurve:
     """Convert several values, whose bounds may differ, to distances from the closer bound, positive inside."""
-    stated, (factor, shown, tolerance) = condition.condition, _unit_of(condition)
+    stated = condition.condition
+    factor, shown, tolerance = _unit_of(condition)
     count = condition.g.shape[1]
     parts = tuple(
         name_part(problem, condition.constraint, stated, i)

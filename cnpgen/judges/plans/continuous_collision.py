@@ -18,9 +18,8 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-from cnpgen.arrays import Array
+from cnpgen.arrays import Array, Mask
 from cnpgen.judges.plans.evaluated_trajectory import Curve
 from cnpgen.judges.plans.measure import EvaluationContext, MeasuredCondition
 from cnpgen.judges.plans.verdict import Margin
@@ -51,11 +50,11 @@ class Intervals:
     # Proven lower bound of the margin over the interval [m], shape (I,).
     lower_bound: Array
 
-    def around_minimum(self) -> NDArray[np.bool_]:
+    def around_minimum(self) -> Mask:
         """Return a mask of the intervals on both sides of the smallest margin, shape (I,)."""
         return np.asarray((self.margin <= self.margin.min()).any(axis=1))
 
-    def unresolved(self) -> NDArray[np.bool_]:
+    def unresolved(self) -> Mask:
         """Return a mask of intervals that may contain a violation, none if there is one at a sample, shape (I,)."""
         chosen = np.zeros(len(self.s), bool)
         # A violation at a sample decides the verdict; only the smallest lower bounds

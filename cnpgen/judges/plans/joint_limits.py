@@ -5,13 +5,12 @@ from dataclasses import dataclass, replace
 from typing import cast
 
 import numpy as np
-from numpy.typing import NDArray
 
-from cnpgen.arrays import Array
+from cnpgen.arrays import Array, Indices
 from cnpgen.judges.plans.bernstein import Maximum, PiecewisePolynomials, find_maximum
 from cnpgen.judges.plans.sampling import times
 from cnpgen.judges.plans.verdict import Margin
-from cnpgen.problems.constraints.constraint import Condition, Constraint
+from cnpgen.problems.constraints.constraint import Conditions, Constraint
 from cnpgen.problems.constraints.joint import (
     JointAcceleration,
     JointJerk,
@@ -22,8 +21,6 @@ from cnpgen.problems.problem import Problem
 from cnpgen.store.joint_units import unit_of
 from cnpgen.world.path import PathWorld
 from cnpgen.world.world import World
-
-Indices = NDArray[np.intp]
 
 MIN_RELATIVE_SCALE = 1e-9  # of a bound: resolution of violations if the tolerance is 0
 EARLY_EXIT_PARTS = 8  # of a span per subdivision with early exit
@@ -60,7 +57,7 @@ class ProvenJointLimits:
 
     constraints: tuple[Constraint, ...]  # constraints of a problem that are proven
     # Condition of each constraint, the same at all states.
-    conditions: tuple[Condition, ...]
+    conditions: Conditions
     joints: tuple[str, ...]  # names of the joints
     tolerance: Array  # accepted violations, shape (L, n)
     bounds: Array  # lower bounds of all joints, then upper ones, shape (L, 2 n)

@@ -193,7 +193,8 @@ class Judge:
             states.jerk,
             exact=not early_exit,
         )
-        metrics, paper = Metrics(), None if self._paper is None else PaperRule()
+        metrics = Metrics()
+        paper = None if self._paper is None else PaperRule()
         if not early_exit:
             jerk = jerks(plan.motion, samples.s)
             metrics = metrics_of(plan.problem, world, samples, jerk)

@@ -13,15 +13,12 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-from cnpgen.arrays import Array
+from cnpgen.arrays import Array, Indices
 from cnpgen.judges.plans.continuous_collision import is_contact
 from cnpgen.judges.plans.measure import EvaluationContext, MeasuredCondition
 from cnpgen.judges.plans.sampling import MIN_PHASE_STEP
 from cnpgen.judges.plans.verdict import Margin
-
-Indices = NDArray[np.intp]
 
 # Relative to the tolerance: error of a maximum that decides about the verdict.
 

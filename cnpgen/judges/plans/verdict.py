@@ -5,10 +5,10 @@ from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields
 from enum import StrEnum
-from typing import Any
 
 import numpy as np
 
+from cnpgen.arrays import JsonObject
 from cnpgen.schema.html_table import html_table
 
 # Replaces a tolerance of 0 in relative violations, so that they can be compared.
@@ -77,7 +77,7 @@ class Margin:
         distance = f"{abs(self.violation):.3g} {self.unit} {side} {self.bound:.6g}"
         return f"{name}: {distance} (tolerance {self.tolerance:.3g}) at t = {self.time:.4f} s, s = {self.phase:.4f}"
 
-    def to_dict(self) -> dict[str, Any]:
+    def to_dict(self) -> JsonObject:
         """Return the margin for JSON; values that are not finite are None."""
         values = {entry.name: getattr(self, entry.name) for entry in fields(self)}
         infinite = {
@@ -112,7 +112,7 @@ class Metrics:
     z_error: float = math.nan
     vertical_error: float = math.nan
 
-    def to_dict(self) -> dict[str, Any]:
+    def to_dict(self) -> JsonObject:
         """Return the metrics for JSON in the units of the paper's tables, without those that do not apply."""
         values = {
             "duration_s": self.duration,
@@ -140,7 +140,7 @@ class PaperRule:
     valid: bool = False
     broken: tuple[str, ...] = ()
 
-    def to_dict(self) -> dict[str, Any]:
+    def to_dict(self) -> JsonObject:
         """Return the result for JSON."""
         return {
             "finished": self.finished,
@@ -197,7 +197,7 @@ class Verdict:
             default=None,
         )
 
-    def to_dict(self) -> dict[str, Any]:
+    def to_dict(self) -> JsonObject:
         """Return the verdict for JSON."""
         worst = self.worst
         return {
@@ -213,7 +213,7 @@ class Verdict:
         }
 
 
-def summarize_verdicts(verdicts: Sequence[Verdict]) -> dict[str, Any]:
+def summarize_verdicts(verdicts: Sequence[Verdict]) -> JsonObject:
     """Count verdicts and average their metrics.
 
     Returns:
@@ -270,7 +270,7 @@ def _statistics(verdicts: Sequence[Verdict]) -> dict[str, dict[str, float]]:
     }
 
 
-def _conditions(verdicts: Sequence[Verdict]) -> dict[str, dict[str, Any]]:
+def _conditions(verdicts: Sequence[Verdict]) -> dict[str, JsonObject]:
     margins_of: dict[str, list[tuple[int, Margin]]] = {}
     for index, verdict in enumerate(verdicts):
         for name, margin in verdict.margins.items():

@@ -19,11 +19,10 @@ import math
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from itertools import combinations
-from typing import Any
 
 import numpy as np
 
-from cnpgen.arrays import Array
+from cnpgen.arrays import Array, JsonMapping
 from cnpgen.judges.rows.row_report import Check, Index, compare
 from cnpgen.problems.constraints.constraint import BOUNDARY_TOLERANCES
 from cnpgen.robots.robot import Robot
@@ -60,7 +59,7 @@ class HitRule:
     full_speed: float | None = None
 
 
-def hit_rule(stages: Iterable[Mapping[str, Any]]) -> HitRule:
+def hit_rule(stages: Iterable[JsonMapping]) -> HitRule:
     """Read the rule for goals from resolved stages."""
     # The rule depends on two stages; other ones leave goals as they are.
     by_kind = {stage.get("use"): stage for stage in stages}

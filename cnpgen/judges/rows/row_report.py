@@ -5,12 +5,11 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from cnpgen.arrays import Array
+from cnpgen.arrays import Array, JsonObject
 from cnpgen.problems.constraints.constraint import End
 
 ENDS: tuple[End, End] = ("start", "goal")
@@ -48,7 +47,7 @@ class Check:
             return self.worst / self.tolerance
         return math.inf if self.worst > 0 else 0.0
 
-    def to_dict(self) -> dict[str, Any]:
+    def to_dict(self) -> JsonObject:
         """Return the check for JSON; an infinite ``worst`` is None."""
         worst = self.worst if math.isfinite(self.worst) else None
         return {**vars(self), "worst": worst}
@@ -78,7 +77,7 @@ class RowReport:
         """Checks that at least one row fails."""
         return tuple(check for check in self.checks if check.n_failed)
 
-    def to_dict(self) -> dict[str, Any]:
+    def to_dict(self) -> JsonObject:
         """Return the report for JSON."""
         checks = [check.to_dict() for check in self.checks]
         return {

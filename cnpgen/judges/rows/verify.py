@@ -6,12 +6,11 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from functools import partial
 from itertools import chain
-from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-from cnpgen.arrays import Array
+from cnpgen.arrays import AnyArray, Array
 from cnpgen.errors import DatasetError
 from cnpgen.judges.plans.judge import judge
 from cnpgen.judges.rows.hits import (
@@ -423,7 +422,7 @@ class PlanCheck:
 
 
 def check_plans(
-    problem: Problem, robot: Robot, columns: Mapping[str, NDArray[Any]]
+    problem: Problem, robot: Robot, columns: Mapping[str, AnyArray]
 ) -> PlanCheck:
     """Judge the plans in columns of a certified dataset, field -> values.
 

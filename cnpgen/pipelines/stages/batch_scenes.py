@@ -7,9 +7,8 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 
-from cnpgen.arrays import Array
+from cnpgen.arrays import Array, Integers
 from cnpgen.kernels.collision.body_arrays import (
     BODY,
     BOX,
@@ -44,7 +43,7 @@ class BatchScenes:
 
     table: SceneTable
     poses: Array
-    grasp_count: NDArray[np.int64]
+    grasp_count: Integers
     grasp_position: Array
     grasp_approach: Array
     grasp_tilt: Array

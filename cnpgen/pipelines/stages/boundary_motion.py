@@ -34,7 +34,7 @@ from cnpgen.problems.constraints.joint import MotorTorques, motor_conditions
 from cnpgen.problems.constraints.table import Table
 from cnpgen.robots.robot import Robot
 from cnpgen.schema.keys import field
-from cnpgen.store.field import Field
+from cnpgen.store.field import Field, Fields
 
 PROJECTION_STEPS = 3  # Newton steps from a millimetre to rounding error
 MAX_VELOCITY_RATIO = 1.005  # largest ratio of a plan's velocity to its limit
@@ -76,7 +76,7 @@ class AtRest(Stage):
         kept = ", which motions must end with" if self.end == "goal" else ""
         return f"set velocity and acceleration of the {self.end} to zero{kept}"
 
-    def outputs(self, context: Context) -> tuple[Field, ...]:
+    def outputs(self, context: Context) -> Fields:
         fields = _motion_fields(context, self.end)
         return (
             fields if self.end == "start" or self.acceleration == "zero" else fields[:1]
@@ -127,7 +127,7 @@ class TableVelocity(Stage):
             f" uniform between 0 and the first limit that it meets; zero in {100 * self.at_rest:.4g} % of the cases"
         )
 
-    def outputs(self, context: Context) -> tuple[Field, ...]:
+    def outputs(self, context: Context) -> Fields:
         return _motion_fields(context, "start")[:1]
 
     def writes(self, context: Context) -> tuple[str, ...]:
@@ -190,7 +190,7 @@ class TableAcceleration(Stage):
             " limits that it meets along a random direction"
         )
 
-    def outputs(self, context: Context) -> tuple[Field, ...]:
+    def outputs(self, context: Context) -> Fields:
         return _motion_fields(context, self.end)[1:]
 
     def prepare(self, context: Context) -> StageFunction:
@@ -220,7 +220,8 @@ def velocity_of_tip(robot: Robot) -> Any:
     """Build ``(q, dq) -> velocity of the tip`` [m/s]."""
     import casadi as ca
 
-    (q_sx, q), (dq_sx, dq) = symbols("q", robot.n), symbols("dq", robot.n)
+    q_sx, q = symbols("q", robot.n)
+    dq_sx, dq = symbols("dq", robot.n)
     velocity = tip_velocity(forward_kinematics(robot.chain, q), dq)
     return ca.Function("velocity_of_tip", [q_sx, dq_sx], [ca.vertcat(*velocity)])
 
@@ -280,11 +281,9 @@ def table_velocity(robot: Robot) -> Any:
     """
     import casadi as ca
 
-    (q_sx, q), (u_sx, u), (s_sx, s) = (
-        symbols("q", robot.n),
-        symbols("u", robot.n),
-        symbols("s", 1),
-    )
+    q_sx, q = symbols("q", robot.n)
+    u_sx, u = symbols("u", robot.n)
+    s_sx, s = symbols("s", 1)
     kin = forward_kinematics(robot.chain, q)
     limit = [float(x) for x in robot.velocity_limit]
     on_manifold = _project(

@@ -14,9 +14,8 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from cnpgen.arrays import Array
+from cnpgen.arrays import Array, Mask
 from cnpgen.errors import RecipeError
 from cnpgen.kernels.symbolic.linalg import symbols
 from cnpgen.kernels.symbolic.obstacle_distances import symbolic_solids
@@ -30,7 +29,7 @@ from cnpgen.robots.shape.hull import coal_hull
 from cnpgen.robots.shape.shape import Shape
 from cnpgen.robots.solid import Box, Solid, height_places, place_obstacles, solids_of
 from cnpgen.schema.keys import field
-from cnpgen.store.field import Field
+from cnpgen.store.field import Field, Fields
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -56,7 +55,7 @@ class Collision(Stage):
         )
         return f"require {ends} to be free of collision, {how}"
 
-    def outputs(self, context: Context) -> tuple[Field, ...]:
+    def outputs(self, context: Context) -> Fields:
         if self.judge == "coal" or context.robot.shape is not None:
             return ()
         text = "distance of the arm's capsule axes from the nearest obstacle at the {}, less the capsules' radius"
@@ -213,10 +212,8 @@ def _minimum_distance(
     """Build the minimum distance of capsules (first point, second point, radius) from the obstacles [m]."""
     import casadi as ca
 
-    (q_sx, q), (poses_sx, poses) = (
-        symbols("q", robot.n),
-        symbols("obstacle_poses", problem.scene_width),
-    )
+    q_sx, q = symbols("q", robot.n)
+    poses_sx, poses = symbols("obstacle_poses", problem.scene_width)
     zero = [0.0] * robot.n
     state = SymbolicState(robot, q, zero, zero, poses, problem.obstacle, None)
     nearest = ca.SX(np.inf)
@@ -256,7 +253,7 @@ def coal_judge(problem: Problem, robot: Robot, radius: float, depth: float) -> A
     heights = _add_obstacles(model, geometry, problem, moving)
     pool = pin.GeometryPool(model, geometry, 1)
 
-    def judge(q: Array, obstacle_poses: Array) -> NDArray[np.bool_]:
+    def judge(q: Array, obstacle_poses: Array) -> Mask:
         # Positions of the sliding joints of the obstacles follow those of the robot.
         states = np.asfortranarray(np.concatenate([q, obstacle_poses[heights]]))
         return np.asarray(

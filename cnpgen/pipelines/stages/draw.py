@@ -1,20 +1,19 @@
 """Stages: draw or list start and goal positions of the tip, and draw the parameters of the problem."""
 
 import math
-from collections.abc import Collection, Iterable, Iterator, Sequence
+from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
-from cnpgen.arrays import Array
+from cnpgen.arrays import Array, NamedErrors, Vector3
 from cnpgen.errors import RecipeError
 from cnpgen.kernels.symbolic.kinematics import tip_position
 from cnpgen.pipelines.stages.candidate_table import in_world, in_world_box
 from cnpgen.pipelines.stages.stage import CandidateBatch, Context, Stage, StageFunction
 from cnpgen.schema.keys import Range, field
-from cnpgen.store.field import Field
+from cnpgen.store.field import Field, Fields
 
-Position = tuple[float, float, float]
 MAX_TASKS = 100_000
 
 
@@ -46,7 +45,7 @@ class DrawPositions(Stage):
             else text
         )
 
-    def outputs(self, context: Context) -> tuple[Field, ...]:
+    def outputs(self, context: Context) -> Fields:
         return tuple(
             position_field(
                 end,
@@ -94,7 +93,7 @@ class DrawGoal(Stage):
             else text
         )
 
-    def outputs(self, context: Context) -> tuple[Field, ...]:
+    def outputs(self, context: Context) -> Fields:
         return (
             position_field(
                 "goal",
@@ -138,11 +137,10 @@ def check_reach(
 
 def position_field(end: str, low: Sequence[float], high: Sequence[float]) -> Field:
     """Describe the field of the tip position at an end, bounded by a box [m]."""
-    text = f"{end} position of the tip"
     return Field(
         f"{end}_xyz",
         "m",
-        text,
+        f"{end} position of the tip",
         3,
         ("x", "y", "z"),
         "context",
@@ -171,7 +169,7 @@ def _box(ranges: tuple[Range, ...]) -> str:
 class GivenPositions(Stage):
     """Stage: goal positions of a list or a grid, with listed start positions or the base configuration."""
 
-    goal: tuple[Position, ...] = field(
+    goal: tuple[Vector3, ...] = field(
         "goal positions: x, y, z of each", unit="m", default=()
     )
     grid: tuple[Range, ...] = field(
@@ -180,13 +178,13 @@ class GivenPositions(Stage):
     counts: tuple[int, ...] = field(
         "number of positions along x, y, z, ends included", low=1, default=()
     )
-    start: tuple[Position, ...] = field(
+    start: tuple[Vector3, ...] = field(
         "start positions, one for all or one per goal; default: the base configuration",
         unit="m",
         default=(),
     )
 
-    def validate(self) -> Iterator[tuple[str, str]]:
+    def validate(self) -> NamedErrors:
         if bool(self.goal) == bool(self.grid):
             yield "goal", "either a list of goals or a grid must be given, and not both"
         for key in ("grid", "counts"):
@@ -224,7 +222,7 @@ class GivenPositions(Stage):
         origin = "listed start positions" if self.start else "the base configuration"
         return f"take {self.tasks:,} {goals}, one after the other, from {origin}"
 
-    def outputs(self, context: Context) -> tuple[Field, ...]:
+    def outputs(self, context: Context) -> Fields:
         boxes = (("start", self._starts(context)), ("goal", self._goals()))
         positions = tuple(
             position_field(
@@ -277,7 +275,7 @@ class DrawParameters(Stage):
     def describe(self) -> str:
         return "draw the parameters of the problem uniformly in their ranges"
 
-    def outputs(self, context: Context) -> tuple[Field, ...]:
+    def outputs(self, context: Context) -> Fields:
         ranges = context.problem.parameters
         if not ranges:
             raise RecipeError(
@@ -289,12 +287,11 @@ class DrawParameters(Stage):
             tuple(getattr(span, end) for span in ranges.ranges)
             for end in ("low", "high")
         )
-        text = "parameters of the problem"
         return (
             Field(
                 "parameters",
                 ranges.units,
-                text,
+                "parameters of the problem",
                 len(ranges),
                 ranges.names,
                 valid_min=low,

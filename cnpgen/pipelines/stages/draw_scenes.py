@@ -7,14 +7,15 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from cnpgen.arrays import Array
 from cnpgen.errors import RecipeError, UsageError
 from cnpgen.pipelines.scene_family import Layout, SceneFamily
 from cnpgen.pipelines.stages.batch_scenes import batch_scenes
 from cnpgen.pipelines.stages.stage import CandidateBatch, Context, Stage, StageFunction
 from cnpgen.problems.constraints.clearance import RobotClearance
 from cnpgen.problems.scenes.scene_problem import MAX_BASE_DEPTH_M
+from cnpgen.robots.observation.primitives import Primitives, depths_of_origin
 from cnpgen.robots.scene import rotations_of, sample_obstacles
 from cnpgen.schema import registry
 from cnpgen.schema.keys import field
@@ -108,7 +109,7 @@ class DrawScenes(Stage):
             concerns="recipe",
         )
 
-    def _shares(self) -> NDArray[np.float64]:
+    def _shares(self) -> Array:
         shares = np.array([family.share for family in self.family])
         # A sum of 0 is refused in ``_check``; here it only must not divide by zero.
         return np.asarray(shares / max(shares.sum(), 1e-300))
@@ -159,28 +160,15 @@ def _paused_garbage_collection() -> Iterator[None]:
             gc.enable()
 
 
-def base_depths(table: SceneTable) -> NDArray[np.float64]:
+def base_depths(table: SceneTable) -> Array:
     """Return the depth of the robot's base, the origin, in the obstacles of each scene [m], negative outside."""
-    # R^T (0 - p): the origin in the frame of each obstacle; by symmetry its absolute
-    # value.
-    local = np.abs(
-        np.einsum(
-            "soji,soj->soi", rotations_of(table), -table.obstacle_position.astype(float)
-        )
+    # Of a box half the edge lengths; otherwise the radius and half the length.
+    is_box = table.obstacle_kind[..., None] == OBSTACLE_KINDS.index("box")
+    sizes = table.obstacle_size * np.where(is_box, 0.5, [1.0, 0.5, 0.0])
+    bodies = Primitives(
+        table.obstacle_kind,
+        table.obstacle_position.astype(float),
+        rotations_of(table),
+        sizes,
     )
-    size = table.obstacle_size.astype(float)
-    kind = table.obstacle_kind
-    across = np.hypot(local[..., 0], local[..., 1])
-    up = local[..., 2]
-    radius = size[..., 0]
-    half = size[..., 1] / 2
-    # Depth of a point: box, sphere, cylinder, capsule, in the order of
-    # ``OBSTACLE_KINDS``.
-    depths = [
-        (size / 2 - local).min(axis=-1),
-        radius - np.linalg.norm(local, axis=-1),
-        np.minimum(radius - across, half - up),
-        radius - np.hypot(across, np.maximum(up - half, 0.0)),
-    ]
-    depth = np.select([kind == code for code in range(len(depths))], depths, -np.inf)
-    return np.asarray(depth.max(axis=1))
+    return np.asarray(depths_of_origin(bodies).max(axis=1))

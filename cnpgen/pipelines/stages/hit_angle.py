@@ -12,7 +12,7 @@ from cnpgen.pipelines.stages.stage import CandidateBatch, Context, Stage, StageF
 from cnpgen.problems.constraints.puck_contact import PuckContact
 from cnpgen.problems.constraints.table import Table
 from cnpgen.schema.keys import field
-from cnpgen.store.field import Field
+from cnpgen.store.field import Field, Fields
 
 
 def wrap(angle: Array) -> Array:
@@ -23,15 +23,14 @@ def wrap(angle: Array) -> Array:
 class _HitAngle(Stage):
     """Base class: hit direction on the table."""
 
-    def outputs(self, context: Context) -> tuple[Field, ...]:
+    def outputs(self, context: Context) -> Fields:
         low = (-float(np.pi),)
         high = (float(np.pi),)
-        text = "direction of the hit about world z, from world x"
         return (
             Field(
                 "hit_angle",
                 "rad",
-                text,
+                "direction of the hit about world z, from world x",
                 role="context",
                 frame="world",
                 valid_min=low,
@@ -120,7 +119,7 @@ class BehindPuck(Stage):
     def describe(self) -> str:
         return f"take the goal for the puck's centre: the tip meets it {1e3 * self.distance:g} mm behind, along the hit"
 
-    def outputs(self, context: Context) -> tuple[Field, ...]:
+    def outputs(self, context: Context) -> Fields:
         table = context.constraint(Table)
         low = (table.x.low, table.y.low, table.z)
         high = (table.x.high, table.y.high, table.z)

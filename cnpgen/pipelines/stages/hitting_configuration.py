@@ -9,9 +9,8 @@ from functools import reduce
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from cnpgen.arrays import Array
+from cnpgen.arrays import Array, Mask
 from cnpgen.errors import RecipeError
 from cnpgen.kernels.kernel import Kernel
 from cnpgen.kernels.symbolic.linalg import Scalar, Vec, symbols
@@ -29,7 +28,7 @@ from cnpgen.pipelines.stages.ik import IK_TOLERANCE, MAX_IK_STEPS, ik_step
 from cnpgen.pipelines.stages.stage import CandidateBatch, Context, Stage, StageFunction
 from cnpgen.robots.robot import Robot
 from cnpgen.schema.keys import field
-from cnpgen.store.field import Field
+from cnpgen.store.field import Fields
 
 REASONS = "no hitting configuration", "joint position limit at the goal"
 
@@ -57,7 +56,7 @@ class HittingConfiguration(Stage):
             f" the {self.near} configuration"
         )
 
-    def outputs(self, context: Context) -> tuple[Field, ...]:
+    def outputs(self, context: Context) -> Fields:
         return (
             context.joint_field(
                 "goal_q", "rad", "joint positions at the goal", "target"
@@ -112,7 +111,7 @@ class _Search:
 
     def solve(
         self, position: Array, direction: Array, home: Array
-    ) -> tuple[Array, NDArray[np.bool_], Array]:
+    ) -> tuple[Array, Mask, Array]:
         """Find the optimum of every candidate.
 
         Returns:
@@ -233,7 +232,7 @@ def _within(robot: Robot, q: Vec) -> Scalar:
 
 def within_limits(
     robot: Robot, kernel: Kernel, q: Array, *parameters: Array
-) -> tuple[Array, NDArray[np.bool_]]:
+) -> tuple[Array, Mask]:
     """Move optima q [rad], shape (n, N), outside joint limits to nearby optima within, by an active-set method.
 
     Joints outside their limits are set to the limit and held. Joints that leave their

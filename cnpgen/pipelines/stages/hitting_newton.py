@@ -53,11 +53,9 @@ def objective(robot: Robot) -> Any:
     """Build ``(q, d, q0) -> f``: the squared manipulability along d minus the penalty on the distance from q0."""
     import casadi as ca
 
-    (q_sx, q), (d_sx, d), (home_sx, home) = (
-        symbols("q", robot.n),
-        direction_symbols(robot),
-        symbols("q0", robot.n),
-    )
+    q_sx, q = symbols("q", robot.n)
+    d_sx, d = direction_symbols(robot)
+    home_sx, home = symbols("q0", robot.n)
     jacobian = forward_kinematics(robot.chain, q).jacobian
     # J^T d, the tip's velocity along d per joint velocity.
     gain = [along(d, column) for column in jacobian]
@@ -180,11 +178,9 @@ def newton_step(robot: Robot) -> Any:
     """Build one Newton step of an arm of revolute joints as an SX function ``(q, p, d, q0) -> (next q, |step|)``."""
     import casadi as ca
 
-    (q_sx, q), (p_sx, p), (home_sx, home) = (
-        symbols("q", robot.n),
-        symbols("p", 3),
-        symbols("q0", robot.n),
-    )
+    q_sx, q = symbols("q", robot.n)
+    p_sx, p = symbols("p", 3)
+    home_sx, home = symbols("q0", robot.n)
     d_sx, d = direction_symbols(robot)
     here = expand(robot, q, d, home)
     following, length = shortened(

@@ -38,7 +38,7 @@ from cnpgen.pipelines.stages.stage import (
 )
 from cnpgen.robots.robot import Robot
 from cnpgen.schema.keys import field
-from cnpgen.store.field import Field
+from cnpgen.store.field import Field, Fields
 
 ZERO_RESIDUAL_M = 1e-11  # residuals below this are treated as zero
 # Task column: hit speed as a fraction of the maximum speed.
@@ -66,8 +66,7 @@ class HittingVelocity(Stage):
         )
         return f"solve the linear program for the fastest joint velocity along the hit{slower}"
 
-    def outputs(self, context: Context) -> tuple[Field, ...]:
-        text = "highest possible speed along the hit at the goal configuration"
+    def outputs(self, context: Context) -> Fields:
         return (
             context.joint_field(
                 "goal_dq", "rad/s", "joint velocities at the goal", "target"
@@ -79,7 +78,13 @@ class HittingVelocity(Stage):
                 role="context",
                 frame="world",
             ),
-            Field("hit_speed_max", "m/s", text, role="diagnostic", frame="world"),
+            Field(
+                "hit_speed_max",
+                "m/s",
+                "highest possible speed along the hit at the goal configuration",
+                role="diagnostic",
+                frame="world",
+            ),
         )
 
     def prepare(self, context: Context) -> StageFunction:
@@ -94,7 +99,7 @@ class HittingVelocity(Stage):
 
         return self._solve(context, draw_share)
 
-    def task_inputs(self, context: Context) -> tuple[Field, ...]:
+    def task_inputs(self, context: Context) -> Fields:
         """List the speed, and its share of the maximum speed.
 
         The share is 1 if neither is given.
@@ -174,11 +179,9 @@ def hitting_velocity(robot: Robot, *, min_speed: float) -> Any:
     """
     import casadi as ca
 
-    (q_sx, q), (d_sx, d), (normal_sx, normal) = (
-        symbols("q", robot.n),
-        direction_symbols(robot),
-        symbols("normal", 3),
-    )
+    q_sx, q = symbols("q", robot.n)
+    d_sx, d = direction_symbols(robot)
+    normal_sx, normal = symbols("normal", 3)
     jacobian = forward_kinematics(robot.chain, q).jacobian
     # Speed along the hit: sum over joints of (d . J_i) dq_i.
     forward = [along(d, column) for column in jacobian]

@@ -1,12 +1,13 @@
 """Inverse kinematics: stages for positions of start, home and goal, free or vertical, and their step."""
 
-from collections.abc import Collection, Iterator
+from collections.abc import Collection
 from dataclasses import dataclass
 from functools import reduce
 from typing import Any
 
 import numpy as np
 
+from cnpgen.arrays import NamedErrors
 from cnpgen.errors import RecipeError
 from cnpgen.kernels.symbolic.kinematics import (
     Kinematics,
@@ -37,7 +38,7 @@ from cnpgen.pipelines.stages.stage import (
 from cnpgen.robots.plausible_values import find_implausible_value
 from cnpgen.robots.robot import Robot
 from cnpgen.schema.keys import Range, field
-from cnpgen.store.field import Field
+from cnpgen.store.field import Fields
 
 # M and rad, before the last step (quadratic convergence, except with joints on their
 # limits).
@@ -193,7 +194,7 @@ class StartIK(GuessedIK):
     def describe(self) -> str:
         return f"solve the start configuration{self._how()} from {self._origin()}"
 
-    def outputs(self, context: Context) -> tuple[Field, ...]:
+    def outputs(self, context: Context) -> Fields:
         return (context.joint_field("start_q", "rad", "joint positions at the start"),)
 
     def prepare(self, context: Context) -> StageFunction:
@@ -224,7 +225,7 @@ class GoalIK(GuessedIK):
         since_version=2,
     )
 
-    def validate(self) -> Iterator[tuple[str, str]]:
+    def validate(self) -> NamedErrors:
         for name in ("from_start", "at_limit"):
             if getattr(self, name) and not self.guess:
                 yield name, "needs random guesses: give guess, too"
@@ -237,7 +238,7 @@ class GoalIK(GuessedIK):
             origin += f"; no joint may be farther than {self.max_change:.4g} rad from the start"
         return f"solve the goal configuration{self._how()} from {origin}"
 
-    def outputs(self, context: Context) -> tuple[Field, ...]:
+    def outputs(self, context: Context) -> Fields:
         return (
             context.joint_field(
                 "goal_q", "rad", "joint positions at the goal", "target"
@@ -301,7 +302,8 @@ def ik_step(
     """
     import casadi as ca
 
-    (q_sx, q), (p_sx, p) = symbols("q", robot.n), symbols("p", 3)
+    q_sx, q = symbols("q", robot.n)
+    p_sx, p = symbols("p", 3)
     held_sx, held = symbols("held", robot.n)
     kin = forward_kinematics(robot.chain, q)
     # Rows of the task: three of position, two of tilt.
@@ -427,7 +429,7 @@ class Home(GuessedIK):
         "box of tip positions of the other homes: x, y, z", unit="m"
     )
 
-    def validate(self) -> Iterator[tuple[str, str]]:
+    def validate(self) -> NamedErrors:
         if self.at_start + self.at_base > 1:
             yield (
                 "at_base",
@@ -442,9 +444,15 @@ class Home(GuessedIK):
             f" {100 * elsewhere:.4g} %"
         )
 
-    def outputs(self, context: Context) -> tuple[Field, ...]:
-        text = "joint positions that those at the goal are chosen close to"
-        return (context.joint_field("home_q", "rad", text, "diagnostic"),)
+    def outputs(self, context: Context) -> Fields:
+        return (
+            context.joint_field(
+                "home_q",
+                "rad",
+                "joint positions that those at the goal are chosen close to",
+                "diagnostic",
+            ),
+        )
 
     def writes(self, context: Context) -> tuple[str, ...]:
         return "home_q", "home_xyz"
@@ -476,9 +484,7 @@ class Home(GuessedIK):
         """Use the start: goals of tasks are chosen near the start configuration."""
 
         def work(candidates: CandidateBatch, _random: np.random.Generator) -> None:
-            candidates["home_q"], candidates["home_xyz"] = (
-                candidates["start_q"],
-                candidates["start_xyz"],
-            )
+            candidates["home_q"] = candidates["start_q"]
+            candidates["home_xyz"] = candidates["start_xyz"]
 
         return work

@@ -12,7 +12,6 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from cnpgen.arrays import Array
 from cnpgen.kernels.kernel import Kernel
@@ -126,11 +125,9 @@ def over_table(*, sides: list[list[float]] | None) -> Any:
     """
     import casadi as ca
 
-    (p_sx, p), (d_sx, d), (corners_sx, corners) = (
-        symbols("p", 2),
-        symbols("d", 2),
-        symbols("corners", 4),
-    )
+    p_sx, p = symbols("p", 2)
+    d_sx, d = symbols("d", 2)
+    corners_sx, corners = symbols("corners", 4)
     given = [p_sx, d_sx] if sides else [p_sx, d_sx, corners_sx]
     spans: Any = sides or list(zip(corners[:2], corners[2:], strict=True))
 
@@ -199,7 +196,7 @@ def overshoot(
     dq: Array,
     *,
     margin: float = 0.0,
-) -> NDArray[np.float64]:
+) -> Array:
     """Return the overshoot of full braking over the worst edge of the table [m], shape (n,), by both kernels.
 
     It is -inf if a straight line stays inside by the margin [m] for 80 ms. The states
@@ -236,7 +233,8 @@ def tip_state(robot: Robot) -> Any:
     """Build ``(q, dq) -> (tip position, tip velocity)``."""
     import casadi as ca
 
-    (q_sx, q), (dq_sx, dq) = symbols("q", robot.n), symbols("dq", robot.n)
+    q_sx, q = symbols("q", robot.n)
+    dq_sx, dq = symbols("dq", robot.n)
     kin = forward_kinematics(robot.chain, q)
     return ca.Function(
         "tip_state",
@@ -255,10 +253,12 @@ def braking_step(robot: Robot, *, height: float) -> Any:
     import casadi as ca
 
     n = robot.n
-    (state_sx, state), (edge_sx, edge) = symbols("state", 2 * n + 1), symbols("edge", 3)
+    state_sx, state = symbols("state", 2 * n + 1)
+    edge_sx, edge = symbols("edge", 3)
     q, dq = state[:n], state[n : 2 * n]
     kin = forward_kinematics(robot.chain, q)
-    velocity, bias = tip_velocity(kin, dq), bias_acceleration(kin, dq)
+    velocity = tip_velocity(kin, dq)
+    bias = bias_acceleration(kin, dq)
     # Velocity and vertical row: n . J and J_z.
     along = [edge[0] * column[0] + edge[1] * column[1] for column in kin.jacobian]
     row = [column[2] for column in kin.jacobian]

@@ -4,9 +4,8 @@ from collections.abc import Sequence
 from itertools import pairwise
 
 import numpy as np
-from numpy.typing import NDArray
 
-from cnpgen.arrays import Array
+from cnpgen.arrays import Array, Integers, Mask
 from cnpgen.kernels.collision.body_arrays import (
     LANES,
     PADDING_DISTANCE_M,
@@ -25,8 +24,6 @@ from cnpgen.problems.problem import Problem
 from cnpgen.robots.obstacle import Obstacle
 from cnpgen.robots.solid import place_obstacles
 
-Mask = NDArray[np.bool_]
-
 
 class _SceneChecker(CollisionChecker):
     """Compiled checks whose obstacles are replaced by arrays of ``BatchScenes.bodies``."""
@@ -41,7 +38,8 @@ class _SceneChecker(CollisionChecker):
 
     def prepare_scenes(self, scenes: BatchScenes) -> None:
         """Build the arrays of all scenes of a batch, for ``place_scene``."""
-        fixed, (bodies, boxes) = len(self._fixed), scenes.bodies
+        fixed = len(self._fixed)
+        bodies, boxes = scenes.bodies
         together = np.zeros((len(scenes), fixed + bodies.shape[1]), bodies.dtype)
         together[:, :fixed] = self._fixed
         together[:, fixed:] = bodies
@@ -103,7 +101,7 @@ class SceneClearance:
     def are_clear(
         self,
         q: Array,
-        scene: NDArray[np.int64],
+        scene: Integers,
         scenes: BatchScenes,
         margin: float = 0.0,
         self_margin: float = 0.0,

@@ -1,13 +1,13 @@
 """Stage: collision-free joint positions of start and goal among the obstacles of a scene."""
 
-from collections.abc import Collection, Iterator
+from collections.abc import Collection
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from cnpgen.arrays import Array
+from cnpgen.arrays import Array, Mask, NamedErrors
 from cnpgen.errors import RecipeError
 from cnpgen.kernels.kernel import Kernel
 from cnpgen.kernels.symbolic.kinematics import forward_kinematics, tip_position
@@ -28,7 +28,7 @@ from cnpgen.pipelines.stages.stage import (
 from cnpgen.pipelines.stages.torque import torque_ratio
 from cnpgen.robots.robot import Robot
 from cnpgen.schema.keys import field
-from cnpgen.store.field import Field
+from cnpgen.store.field import Fields
 
 Indices = NDArray[np.int64]
 
@@ -80,7 +80,7 @@ class SceneEnds(Stage):
     grasps: int = field("grasps of a scene that are tried", default=8, low=1, high=100)
     poses: int = field("random poses at each grasp", default=12, low=1, high=100)
 
-    def validate(self) -> Iterator[tuple[str, str]]:
+    def validate(self) -> NamedErrors:
         total = self.neutral + self.grasp + self.random
         if abs(total - 1) > 1e-9:
             yield "random", f"the shares of starts must add up to 1, got {total:g}"
@@ -92,7 +92,7 @@ class SceneEnds(Stage):
             f" straight line connects in at most {100 * self.straight:.3g} % of the cases"
         )
 
-    def outputs(self, context: Context) -> tuple[Field, ...]:
+    def outputs(self, context: Context) -> Fields:
         center = context.robot.chain.joints[0].translation
         reach = context.robot.chain.reach
         low = (np.asarray(center) - reach).tolist()
@@ -106,7 +106,7 @@ class SceneEnds(Stage):
             position_field("goal", low, high),
         )
 
-    def task_inputs(self, context: Context) -> tuple[Field, ...]:
+    def task_inputs(self, context: Context) -> Fields:
         return self.outputs(context)[:2]
 
     def complete(self, context: Context, given: Collection[str]) -> StageFunction:
@@ -233,9 +233,7 @@ class _EndStates:
             for name, each, own, mask in parts
         }
 
-    def _are_valid(
-        self, scenes: BatchScenes, q: Array, scene: Indices
-    ) -> NDArray[np.bool_]:
+    def _are_valid(self, scenes: BatchScenes, q: Array, scene: Indices) -> Mask:
         """Return which states are within limits, can be held, and are clear in their scene, shape (K,)."""
         robot = self._robot
         valid = (
@@ -358,7 +356,7 @@ class _EndStates:
 
     def _lines_collide(
         self, scenes: BatchScenes, start: Array, goal: Array, scene: Indices
-    ) -> NDArray[np.bool_]:
+    ) -> Mask:
         """Return which straight lines have a state that is not clear, shape (P,).
 
         A few states are checked.
@@ -385,7 +383,7 @@ def _taken(q: Array, state: Indices) -> Array:
     return np.where(state >= 0, q[:, np.maximum(state, 0)], np.nan)
 
 
-def _is_first(key: Indices) -> NDArray[np.bool_]:
+def _is_first(key: Indices) -> Mask:
     """Return which entries do not occur before, shape (P,)."""
     first = np.zeros(len(key), bool)
     first[np.unique(key, return_index=True)[1]] = True

@@ -9,9 +9,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
 
-from cnpgen.arrays import Array
+from cnpgen.arrays import Array, Integers
 from cnpgen.errors import RecipeError, UsageError
 from cnpgen.kernels.library import Backend, KernelLibrary, problem_kernels
 from cnpgen.problems.constraints.constraint import Constraint
@@ -20,7 +19,7 @@ from cnpgen.problems.problem import Problem
 from cnpgen.robots.robot import Robot
 from cnpgen.schema import registry
 from cnpgen.schema.keys import field as key
-from cnpgen.store.field import Field
+from cnpgen.store.field import Field, Fields
 
 if TYPE_CHECKING:
     from cnpgen.pipelines.stages.batch_scenes import BatchScenes
@@ -135,9 +134,9 @@ class CandidateBatch:
         self.scenes: BatchScenes | None = None
 
     @property
-    def scene(self) -> NDArray[np.int64]:
+    def scene(self) -> Integers:
         """Index in ``scenes`` of the scene of each remaining candidate, ascending, shape (n,)."""
-        index: NDArray[np.int64] = self.columns["scene"][0].astype(np.int64)
+        index: Integers = self.columns["scene"][0].astype(np.int64)
         return index
 
     def __getitem__(self, name: str) -> Array:
@@ -238,7 +237,7 @@ class Stage(ABC):
     def describe(self) -> str:
         """Describe the stage in one sentence, with its values and units."""
 
-    def outputs(self, context: Context) -> tuple[Field, ...]:
+    def outputs(self, context: Context) -> Fields:
         """List the stored fields that this stage writes, in order; by default none."""
         return ()
 
@@ -262,7 +261,7 @@ class Stage(ABC):
             ``candidates.draw`` only.
         """
 
-    def task_inputs(self, context: Context) -> tuple[Field, ...]:
+    def task_inputs(self, context: Context) -> Fields:
         """List the fields that tasks may give instead.
 
         By default all outputs except diagnostics.

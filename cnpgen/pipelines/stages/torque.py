@@ -11,7 +11,7 @@ from cnpgen.kernels.symbolic.symbolic_state import SymbolicState
 from cnpgen.pipelines.stages.stage import CandidateBatch, Context, Stage, StageFunction
 from cnpgen.robots.robot import Robot
 from cnpgen.schema.keys import field
-from cnpgen.store.field import Field
+from cnpgen.store.field import Field, Fields
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -27,13 +27,12 @@ class GravityTorque(Stage):
     def describe(self) -> str:
         return f"require that the torque that holds the {self.end} configuration, payload included, is within its limits"
 
-    def outputs(self, context: Context) -> tuple[Field, ...]:
-        text = f"largest holding torque at the {self.end}, as a fraction of its planning limit"
+    def outputs(self, context: Context) -> Fields:
         return (
             Field(
                 f"{self.end}_torque_ratio",
                 "1",
-                text,
+                f"largest holding torque at the {self.end}, as a fraction of its planning limit",
                 role="diagnostic",
                 valid_min=(0.0,),
                 valid_max=(1.0,),
@@ -60,10 +59,8 @@ def torque_ratio(robot: Robot) -> Any:
     """
     import casadi as ca
 
-    (q_sx, q), (parameters_sx, parameters) = (
-        symbols("q", robot.n),
-        symbols("parameters", len(robot.parameters)),
-    )
+    q_sx, q = symbols("q", robot.n)
+    parameters_sx, parameters = symbols("parameters", len(robot.parameters))
     zero = [0.0] * robot.n
     # Friction at rest is in the limit, so torques are those of the rigid body.
     torque = SymbolicState(robot, q, zero, zero, parameters, (), None).torque

@@ -8,9 +8,14 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from cnpgen.arrays import Array
-from cnpgen.problems.constraints.constraint import Condition, Constraint, End
-from cnpgen.problems.constraints.tip_manifold import Vector, along, beside, unit
+from cnpgen.arrays import Array, Vector3
+from cnpgen.problems.constraints.constraint import (
+    Condition,
+    Conditions,
+    Constraint,
+    End,
+)
+from cnpgen.problems.constraints.tip_manifold import along, beside, unit
 from cnpgen.robots.parameter_ranges import UPRIGHT_TOLERANCE
 from cnpgen.schema.keys import field
 
@@ -51,23 +56,23 @@ class TipAxis(Constraint):
         """Value of the parameter ``upright_tolerance`` of samples without it [rad]."""
         return self.tolerance
 
-    def symbolic(self, state: "SymbolicState") -> tuple[Condition, ...]:
+    def symbolic(self, state: "SymbolicState") -> Conditions:
         """State the tilt [rad]."""
         return self._held(self._symbolic_axis(state), state.parameters)
 
-    def measured(self, world: "World") -> tuple[Condition, ...]:
+    def measured(self, world: "World") -> Conditions:
         """Evaluate the tilt of Pinocchio's tip frame [rad]."""
         return self._held(self._measured_axis(world), world.parameters.values)
 
-    def symbolic_at(self, state: "SymbolicState", end: End) -> tuple[Condition, ...]:  # noqa: ARG002
+    def symbolic_at(self, state: "SymbolicState", end: End) -> Conditions:  # noqa: ARG002
         """State the tilt of a boundary state [rad], in radians for all samples."""
         return self._held(self._symbolic_axis(state), {})
 
-    def measured_at(self, world: "World", end: End) -> tuple[Condition, ...]:  # noqa: ARG002
+    def measured_at(self, world: "World", end: End) -> Conditions:  # noqa: ARG002
         """Evaluate the tilt of a boundary state [rad], in radians for all samples."""
         return self._held(self._measured_axis(world), {})
 
-    def judged(self, world: "World") -> tuple[Condition, ...]:
+    def judged(self, world: "World") -> Conditions:
         """Evaluate the angle between axis and direction [rad]."""
         # Without parameters the tilt is in rad: the verdict limits the angle, not its
         # multiple.
@@ -111,7 +116,7 @@ class TipAxis(Constraint):
 
     def _held(
         self, pointing: Sequence[Any], parameters: Mapping[str, Any]
-    ) -> tuple[Condition, ...]:
+    ) -> Conditions:
         """State the tilt of an axis, which is given along axes that turn with the direction."""
         # e1 . R a and e2 . R a: sines of the tilt.
         tilt = [along(row, pointing) for row in self.across]
@@ -137,10 +142,10 @@ class Axis(TipAxis):
     """Constraint: a tip axis is within an angle of a direction, or aligned with it and at rest at the ends."""
 
     reason = "tool tilted"
-    axis: Vector = field(
+    axis: Vector3 = field(
         "axis in the tip frame, of any length", default=(0.0, 0.0, 1.0)
     )
-    direction: Vector = field(
+    direction: Vector3 = field(
         "direction in the world, of any length", default=(0.0, 0.0, 1.0)
     )
     angle: float = field(
@@ -181,14 +186,12 @@ class Axis(TipAxis):
             return super().allowed(condition)
         return np.full(len(condition.g), self._cosine_tolerance(self.angle))
 
-    def judged(self, world: "World") -> tuple[Condition, ...]:
+    def judged(self, world: "World") -> Conditions:
         """Evaluate the angle between axis and direction [rad], or its cosine for a range of angles."""
         if not self.angle:
             return super().judged(world)
-        (condition,), angle = (
-            self._held(self._measured_axis(world), {}),
-            world.parameters.values.get(UPRIGHT_TOLERANCE),
-        )
+        (condition,) = self._held(self._measured_axis(world), {})
+        angle = world.parameters.values.get(UPRIGHT_TOLERANCE)
         if angle is None:
             return (condition,)
         return (
@@ -199,7 +202,7 @@ class Axis(TipAxis):
             ),
         )
 
-    def symbolic_at(self, state: "SymbolicState", end: End) -> tuple[Condition, ...]:
+    def symbolic_at(self, state: "SymbolicState", end: End) -> Conditions:
         """State the tilt and, for an aligned axis, its rates."""
         # The axis may move within its cone at the ends, so that its rates are free.
         if self.angle:
@@ -213,7 +216,7 @@ class Axis(TipAxis):
             *self._resting(self._symbolic_axis(state), *turning),
         )
 
-    def measured_at(self, world: "World", end: End) -> tuple[Condition, ...]:
+    def measured_at(self, world: "World", end: End) -> Conditions:
         """Evaluate the tilt and, for an aligned axis, its rates."""
         if self.angle:
             return self.measured(world)
@@ -228,7 +231,7 @@ class Axis(TipAxis):
 
     def _held(
         self, pointing: Sequence[Any], parameters: Mapping[str, Any]
-    ) -> tuple[Condition, ...]:
+    ) -> Conditions:
         if not self.angle:
             return super()._held(pointing, parameters)
         # d . R a >= cos(angle): the cosine is linear in R, the angle is not smooth at
@@ -257,7 +260,7 @@ class Axis(TipAxis):
 
     def _resting(
         self, u: Sequence[Any], omega: Sequence[Any], alpha: Sequence[Any]
-    ) -> tuple[Condition, ...]:
+    ) -> Conditions:
         """Return the rates of the axis u orthogonal to the direction, from ``w x u`` and ``a x u + w x (w x u)``."""
         from cnpgen.kernels.symbolic.linalg import add, cross
 

@@ -4,9 +4,9 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
-from numpy.typing import NDArray
 
-from cnpgen.problems.constraints.constraint import Condition, Constraint
+from cnpgen.arrays import Mask
+from cnpgen.problems.constraints.constraint import Condition, Conditions, Constraint
 from cnpgen.robots.parameter_ranges import optional_key
 from cnpgen.schema.keys import field
 
@@ -41,7 +41,7 @@ class DistanceConstraint(Constraint):
         *,
         parts: tuple[str, ...] = (),
         sufficient: bool = False,
-    ) -> tuple[Condition, ...]:
+    ) -> Conditions:
         """State that m distances are at least one bound, or m [m]."""
         m = len(distances)
         lower = np.full(m, least, float)
@@ -111,12 +111,13 @@ class RobotClearance(DistanceConstraint):
         )
         return min(self.tolerance, limit)
 
-    def symbolic(self, state: "SymbolicState") -> tuple[Condition, ...]:
+    def symbolic(self, state: "SymbolicState") -> Conditions:
         """State the signed distance of every moving segment, or capsule's axis, from every obstacle [m]."""
         from cnpgen.kernels.symbolic.obstacle_distances import symbolic_solids
 
         # Axes of capsules: the radius is in the bound.
-        (segments, radii), solids = self._capsules(state), symbolic_solids(state)
+        segments, radii = self._capsules(state)
+        solids = symbolic_solids(state)
         distances = [
             solid.separation(a, b, state.freeze)
             for a, b in segments
@@ -124,11 +125,12 @@ class RobotClearance(DistanceConstraint):
         ]
         return self._clear(distances, radii, sufficient=_is_cautious(state))
 
-    def penalized(self, state: "SymbolicState") -> tuple[Condition, ...]:
+    def penalized(self, state: "SymbolicState") -> Conditions:
         """State distances with better gradients: inside an obstacle, the depth of the center [m]."""
         from cnpgen.kernels.symbolic.obstacle_distances import symbolic_solids
 
-        (segments, radii), solids = self._capsules(state), symbolic_solids(state)
+        segments, radii = self._capsules(state)
+        solids = symbolic_solids(state)
         distances = [
             solid.smooth_separation(a, b, state.freeze)
             for a, b in segments
@@ -136,7 +138,7 @@ class RobotClearance(DistanceConstraint):
         ]
         return self._clear(distances, radii, sufficient=_is_cautious(state))
 
-    def measured(self, world: "World") -> tuple[Condition, ...]:
+    def measured(self, world: "World") -> Conditions:
         """Measure the signed distances with Coal [m]."""
         shape = world.robot.shape
         if shape is None:
@@ -164,7 +166,7 @@ class RobotClearance(DistanceConstraint):
             ),
         )
 
-    def met(self, path: "PathWorld", tolerance: float) -> NDArray[np.bool_] | None:
+    def met(self, path: "PathWorld", tolerance: float) -> Mask | None:
         """Return a mask of the states with sufficient distance of the convex parts from the obstacles."""
         return (
             path.pairs(self.bodies).clear_states(self.distance - tolerance)
@@ -172,7 +174,7 @@ class RobotClearance(DistanceConstraint):
             else None
         )
 
-    def solved(self, world: "World") -> tuple[Condition, ...]:
+    def solved(self, world: "World") -> Conditions:
         """Return the conditions of the capsules."""
         shape = world.robot.shape
         capsule_axes = world.robot.capsule_axes
@@ -201,7 +203,7 @@ class RobotClearance(DistanceConstraint):
 
     def _clear(
         self, distances: list[Any], radii: list[float], *, sufficient: bool = False
-    ) -> tuple[Condition, ...]:
+    ) -> Conditions:
         """State that the distance of every capsule axis is at least its radius plus ``distance``."""
         # Distances are ordered capsule by capsule: each radius is repeated for all
         # obstacles.
@@ -225,7 +227,7 @@ class ObjectContact(DistanceConstraint):
         plausible=0.5,
     )
 
-    def symbolic(self, state: "SymbolicState") -> tuple[Condition, ...]:
+    def symbolic(self, state: "SymbolicState") -> Conditions:
         """State the separation of the object from every obstacle [m]."""
         from cnpgen.kernels.symbolic.obstacle_distances import symbolic_solids
 
@@ -239,13 +241,13 @@ class ObjectContact(DistanceConstraint):
             distances, -self.depth, sufficient=_has_poses(state.obstacles)
         )
 
-    def measured(self, world: "World") -> tuple[Condition, ...]:
+    def measured(self, world: "World") -> Conditions:
         """Measure the signed distances with Coal [m]."""
         # Legal contacts have distances down to -depth, so the search for the distance
         # stops there.
         return self._at_least(world.object_distances(-self.depth), -self.depth)
 
-    def solved(self, world: "World") -> tuple[Condition, ...]:
+    def solved(self, world: "World") -> Conditions:
         """Return the conditions on the solver's shapes of the obstacles."""
         return self._at_least(
             [0.0] * len(world.obstacles),

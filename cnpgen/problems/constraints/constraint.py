@@ -7,9 +7,8 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, ClassVar, Literal, Self
 
 import numpy as np
-from numpy.typing import NDArray
 
-from cnpgen.arrays import Array
+from cnpgen.arrays import Array, Mask
 from cnpgen.schema.keys import field
 
 if TYPE_CHECKING:
@@ -103,6 +102,10 @@ class Condition:
         # The maximum of values with nan is nan.
         worst = float(np.max(np.maximum(self.lower - g, g - self.upper), initial=0.0))
         return worst if np.isfinite(worst) else np.inf
+
+
+Conditions = tuple[Condition, ...]
+"""The conditions of a constraint on one state."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -243,7 +246,7 @@ class Constraint(ABC):
         """
         return self.measured(world)
 
-    def met(self, path: PathWorld, tolerance: float) -> NDArray[np.bool_] | None:  # noqa: ARG002
+    def met(self, path: PathWorld, tolerance: float) -> Mask | None:  # noqa: ARG002
         """Return a mask of the K states that satisfy ``measured`` up to a tolerance, or None without a fast check.
 
         The default is None; constraints with a batched check override it.

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
 import numpy as np
 
 from cnpgen.arrays import Array
-from cnpgen.problems.constraints.constraint import Condition, Constraint
+from cnpgen.problems.constraints.constraint import Condition, Conditions, Constraint
 from cnpgen.robots.drive import RIGID, Drive, SpeedLine
 from cnpgen.schema.keys import field
 from cnpgen.store.joint_units import units_of_joints
@@ -41,20 +41,18 @@ class _RelativeLimit(Constraint):
         """Return the fraction of the limit, shape (m,)."""
         return self.tolerance * condition.upper
 
-    def symbolic(self, state: "SymbolicState") -> tuple[Condition, ...]:
+    def symbolic(self, state: "SymbolicState") -> Conditions:
         """State the limits on the rates in SI units."""
         return self._within(state, state.parameters.get(self.factor_name))
 
-    def measured(self, world: "World") -> tuple[Condition, ...]:
+    def measured(self, world: "World") -> Conditions:
         """Compare the rates in SI units with the limits.
 
         Torques are Pinocchio's inverse dynamics.
         """
         return self._within(world, world.parameters.values.get(self.factor_name))
 
-    def _within(
-        self, state: "SymbolicState | World", factor: Any
-    ) -> tuple[Condition, ...]:
+    def _within(self, state: "SymbolicState | World", factor: Any) -> Conditions:
         """Divide rates by the factor of their limits, so that the bounds are the same for all samples."""
         # Boundary states have no jerk.
         if (rates := getattr(state, self.rates)) is None:
@@ -66,7 +64,7 @@ class _RelativeLimit(Constraint):
         return (Condition(self.condition_name, unit, g, -limit, limit, "limit"),)
 
 
-def _between(robot: "Robot", q: list[Any]) -> tuple[Condition, ...]:
+def _between(robot: "Robot", q: list[Any]) -> Conditions:
     bounds = robot.position_lower, robot.position_upper
     return (Condition("joint position", robot.units("rad"), q, *bounds, "limit"),)
 
@@ -82,11 +80,11 @@ class JointPosition(Constraint):
         "violation that a valid motion may have", unit="rad", low=0.0, plausible=1.0
     )
 
-    def symbolic(self, state: "SymbolicState") -> tuple[Condition, ...]:
+    def symbolic(self, state: "SymbolicState") -> Conditions:
         """State the limits on q [rad]."""
         return _between(state.robot, state.q)
 
-    def measured(self, world: "World") -> tuple[Condition, ...]:
+    def measured(self, world: "World") -> Conditions:
         """Compare q [rad] with the limits."""
         return _between(world.robot, list(world.q))
 
@@ -152,9 +150,7 @@ class JointTorque(_RelativeLimit):
     rates = "torque"
     limit = "torque_limit"
 
-    def _within(
-        self, state: "SymbolicState | World", factor: Any
-    ) -> tuple[Condition, ...]:
+    def _within(self, state: "SymbolicState | World", factor: Any) -> Conditions:
         drive = state.robot.drive
         if drive is None:
             return super()._within(state, factor)
@@ -260,15 +256,15 @@ class TipSpeed(Constraint):
             len(condition.g), (self.limit + self.tolerance) ** 2 - self.limit**2
         )
 
-    def symbolic(self, state: "SymbolicState") -> tuple[Condition, ...]:
+    def symbolic(self, state: "SymbolicState") -> Conditions:
         """State the square of the tip's speed [m^2/s^2]."""
         return self._slow(state.tip_velocity)
 
-    def measured(self, world: "World") -> tuple[Condition, ...]:
+    def measured(self, world: "World") -> Conditions:
         """Evaluate Pinocchio's velocity of the tip."""
         return self._slow(list(world.tip_velocity))
 
-    def _slow(self, velocity: Sequence[Any]) -> tuple[Condition, ...]:
+    def _slow(self, velocity: Sequence[Any]) -> Conditions:
         square = velocity[0] ** 2 + velocity[1] ** 2 + velocity[2] ** 2
         return (
             Condition(

@@ -5,14 +5,13 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from cnpgen.arrays import Array
+from cnpgen.arrays import Array, Mask
 from cnpgen.problems.constraints.clearance import (
     MAX_LINK_PENETRATION_M,
     DistanceConstraint,
 )
-from cnpgen.problems.constraints.constraint import Condition, End
+from cnpgen.problems.constraints.constraint import Conditions, End
 from cnpgen.schema.keys import field
 
 if TYPE_CHECKING:
@@ -41,7 +40,7 @@ class LinkClearance(DistanceConstraint):
         """Tolerance up to a penetration of ``MAX_LINK_PENETRATION_M``."""
         return min(self.tolerance, self.distance + MAX_LINK_PENETRATION_M)
 
-    def met(self, path: "PathWorld", tolerance: float) -> NDArray[np.bool_]:
+    def met(self, path: "PathWorld", tolerance: float) -> Mask:
         """Return a mask of the states with sufficient distances between the bodies."""
         return path.pairs(self.bodies).clear_states(self.distance - tolerance)
 
@@ -65,17 +64,17 @@ class SelfClearance(LinkClearance):
         "violation that a valid motion may have", unit="m", low=0.0, plausible=0.5
     )
 
-    def symbolic(self, state: "SymbolicState") -> tuple[Condition, ...]:
+    def symbolic(self, state: "SymbolicState") -> Conditions:
         """State the distances of the capsules' axes [m] of the pairs for solvers."""
         return self._capsule_distances(state, _for_solvers(state.robot))
 
-    def measured(self, world: "World") -> tuple[Condition, ...]:
+    def measured(self, world: "World") -> Conditions:
         """Measure the signed distances of the convex parts with Coal [m]."""
         distances = world.self_distances(self.distance)
         parts = names_of_pairs(world.robot.shape)
         return self._at_least(distances, self.distance, parts=parts)
 
-    def solved(self, world: "World") -> tuple[Condition, ...]:
+    def solved(self, world: "World") -> Conditions:
         """Return the conditions of the capsules."""
         # Solvers read the bounds only: the distances are placeholders.
         radii = _radii(world.robot, _for_solvers(world.robot))
@@ -83,7 +82,7 @@ class SelfClearance(LinkClearance):
             [0.0] * len(radii), radii + self.distance, sufficient=True
         )
 
-    def symbolic_at(self, state: "SymbolicState", end: End) -> tuple[Condition, ...]:  # noqa: ARG002
+    def symbolic_at(self, state: "SymbolicState", end: End) -> Conditions:  # noqa: ARG002
         """State the distances of all pairs."""
         # Boundary states are checked for all pairs, since a conservative condition
         # rejects none by itself.
@@ -91,7 +90,7 @@ class SelfClearance(LinkClearance):
 
     def _capsule_distances(
         self, state: "SymbolicState", pairs: "Sequence[LinkPair]"
-    ) -> tuple[Condition, ...]:
+    ) -> Conditions:
         from cnpgen.kernels.symbolic.convex_distances import segment_distance
 
         ends = [
@@ -158,7 +157,7 @@ class ObjectClearance(LinkClearance):
         plausible=0.5,
     )
 
-    def symbolic(self, state: "SymbolicState") -> tuple[Condition, ...]:
+    def symbolic(self, state: "SymbolicState") -> Conditions:
         """State the distances of the capsules' axes from the object [m]."""
         from cnpgen.kernels.symbolic.obstacle_distances import held_cuboid
 
@@ -170,13 +169,13 @@ class ObjectClearance(LinkClearance):
         ]
         return self._clear(distances, capsules)
 
-    def measured(self, world: "World") -> tuple[Condition, ...]:
+    def measured(self, world: "World") -> Conditions:
         """Measure the signed distances of the convex parts with Coal [m]."""
         distances = world.held_object_distances(self.distance)
         parts = names_of_pairs(world.robot.held_shape)
         return self._at_least(distances, self.distance, parts=parts)
 
-    def solved(self, world: "World") -> tuple[Condition, ...]:
+    def solved(self, world: "World") -> Conditions:
         """Return the conditions of the capsules."""
         capsules = _solver_capsules(world.robot)
         return self._clear(
@@ -190,7 +189,7 @@ class ObjectClearance(LinkClearance):
         distances: list[Any],
         capsules: "list[Capsule]",
         parts: tuple[str, ...] = (),
-    ) -> tuple[Condition, ...]:
+    ) -> Conditions:
         least = np.array([capsule.radius + self.distance for capsule in capsules])
         return self._at_least(distances, least, parts=parts, sufficient=True)
 

@@ -5,12 +5,11 @@ from functools import cached_property
 
 import numpy as np
 
-from cnpgen.arrays import Array
+from cnpgen.arrays import Array, Vector3
 from cnpgen.problems.constraints.tip_manifold import (
     BOUND_KINKS,
     TipManifold,
     TipRegion,
-    Vector,
     beside,
     unit,
 )
@@ -30,9 +29,9 @@ class Plane(TipManifold):
     held_name = "plane distance"
     velocity_name = "velocity across the plane"
     acceleration_name = "acceleration across the plane"
-    point: Vector = field("point of the plane", unit="m")
-    normal: Vector = field("normal of the plane, of any length")
-    along: Vector | None = field(
+    point: Vector3 = field("point of the plane", unit="m")
+    normal: Vector3 = field("normal of the plane, of any length")
+    along: Vector3 | None = field(
         "direction in the plane along which u is measured", default=None
     )
     u: Range | None = field(
@@ -102,8 +101,8 @@ class Line(TipManifold):
     held_name = "line distance"
     velocity_name = "velocity across the line"
     acceleration_name = "acceleration across the line"
-    point: Vector = field("point of the line", unit="m")
-    direction: Vector = field("direction of the line, of any length")
+    point: Vector3 = field("point of the line", unit="m")
+    direction: Vector3 = field("direction of the line, of any length")
     piece: Range | None = field(
         "range of the tip along the line, from the point", unit="m", default=None
     )

@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from cnpgen.arrays import Array
-from cnpgen.problems.constraints.constraint import Condition, End
+from cnpgen.arrays import Array, Vector3
+from cnpgen.problems.constraints.constraint import Condition, Conditions, End
 from cnpgen.problems.constraints.tip_manifold import TipManifold, TipRegion
 from cnpgen.schema.keys import Range, field
 
@@ -32,7 +32,7 @@ class Pose(TipManifold):
     held_name = "pose position"
     velocity_name = "velocity out of the pose"
     acceleration_name = "acceleration out of the pose"
-    rpy: tuple[float, float, float] = field(
+    rpy: Vector3 = field(
         "orientation in the world: roll, pitch, yaw, as in a URDF",
         unit="rad",
         plausible=2 * np.pi,
@@ -64,22 +64,23 @@ class Pose(TipManifold):
     @property
     def rotation(self) -> Array:
         """Required rotation, shape (3, 3)."""
-        (cr, cp, cy), (sr, sp, sy) = np.cos(self.rpy), np.sin(self.rpy)
+        cr, cp, cy = np.cos(self.rpy)
+        sr, sp, sy = np.sin(self.rpy)
         roll = np.array([[1, 0, 0], [0, cr, -sr], [0, sr, cr]])
         pitch = np.array([[cp, 0, sp], [0, 1, 0], [-sp, 0, cp]])
         yaw = np.array([[cy, -sy, 0], [sy, cy, 0], [0, 0, 1]])
         # URDF convention, fixed axes: R = Rz(yaw) Ry(pitch) Rx(roll).
         return np.asarray(yaw @ pitch @ roll)
 
-    def symbolic(self, state: "SymbolicState") -> tuple[Condition, ...]:
+    def symbolic(self, state: "SymbolicState") -> Conditions:
         """State position [m] and orientation [rad]."""
         return (*super().symbolic(state), *self._turned(state.kinematics.rotation))
 
-    def measured(self, world: "World") -> tuple[Condition, ...]:
+    def measured(self, world: "World") -> Conditions:
         """Evaluate Pinocchio's tip frame."""
         return (*super().measured(world), *self._turned(list(world.tip_rotation)))
 
-    def judged(self, world: "World") -> tuple[Condition, ...]:
+    def judged(self, world: "World") -> Conditions:
         """Evaluate the position [m] and the angle of the orientation [rad]."""
         *position, sines, cosine = self.measured(world)
         # |sine| and cosine determine the angle up to half a turn.
@@ -99,15 +100,15 @@ class Pose(TipManifold):
             else allowed
         )
 
-    def symbolic_at(self, state: "SymbolicState", end: End) -> tuple[Condition, ...]:  # noqa: ARG002
+    def symbolic_at(self, state: "SymbolicState", end: End) -> Conditions:  # noqa: ARG002
         """State position, orientation and their rates."""
         return (*self.symbolic(state), *self._resting(state))
 
-    def measured_at(self, world: "World", end: End) -> tuple[Condition, ...]:  # noqa: ARG002
+    def measured_at(self, world: "World", end: End) -> Conditions:  # noqa: ARG002
         """Evaluate position, orientation and their rates with Pinocchio."""
         return (*self.measured(world), *self._resting(world))
 
-    def _resting(self, state: "SymbolicState | World") -> tuple[Condition, ...]:
+    def _resting(self, state: "SymbolicState | World") -> Conditions:
         """State that the tip moves along its free directions only and does not turn."""
         zero = np.zeros(3)
         axes = ("x", "y", "z")
@@ -127,7 +128,7 @@ class Pose(TipManifold):
             ),
         )
 
-    def _turned(self, rotation: Sequence[Any]) -> tuple[Condition, ...]:
+    def _turned(self, rotation: Sequence[Any]) -> Conditions:
         wanted = self.rotation
         # R_wanted^T R: the rotation that is left.
         relative = [

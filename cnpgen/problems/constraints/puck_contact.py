@@ -12,15 +12,17 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from cnpgen.arrays import Array
-from cnpgen.problems.constraints.constraint import Condition, Constraint, End
+from cnpgen.arrays import Array, Mask, NamedErrors
+from cnpgen.problems.constraints.constraint import (
+    Condition,
+    Conditions,
+    Constraint,
+    End,
+)
 from cnpgen.schema.keys import field
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
-
     from cnpgen.kernels.symbolic.symbolic_state import SymbolicState
     from cnpgen.world.world import World
 
@@ -77,7 +79,7 @@ class PuckContact(Constraint):
         "violation that a valid motion may have", unit="m", low=0.0, plausible=0.5
     )
 
-    def validate(self) -> Iterator[tuple[str, str]]:
+    def validate(self) -> NamedErrors:
         """Yield (key, error) pairs."""
         if not 0 < self.overlap < self.last - ADDED_RADIUS_M:
             yield (
@@ -111,11 +113,11 @@ class PuckContact(Constraint):
             values[~is_hit[:, 0]] = PUCK_OUT_OF_REACH_M
         return values
 
-    def symbolic(self, state: SymbolicState) -> tuple[Condition, ...]:
+    def symbolic(self, state: SymbolicState) -> Conditions:
         """State the distance of the centres [m] in the form for solvers."""
         return self._cone(*self._symbolic_distances(state), SOLVER_MARGIN_M)
 
-    def penalized(self, state: SymbolicState) -> tuple[Condition, ...]:
+    def penalized(self, state: SymbolicState) -> Conditions:
         """State the distance for the training loss: the square of a large violation grows linearly."""
         import casadi as ca
 
@@ -133,7 +135,7 @@ class PuckContact(Constraint):
             ),
         )
 
-    def symbolic_at(self, state: SymbolicState, end: End) -> tuple[Condition, ...]:
+    def symbolic_at(self, state: SymbolicState, end: End) -> Conditions:
         """State the distance at the start [m], where no contact is allowed.
 
         The goal is in contact.
@@ -145,11 +147,11 @@ class PuckContact(Constraint):
             self.contact_range + ADDED_RADIUS_M, self._symbolic_distances(state)[1]
         )
 
-    def measured(self, world: World) -> tuple[Condition, ...]:
+    def measured(self, world: World) -> Conditions:
         """Evaluate the distance of the centres with Pinocchio's tip position [m]."""
         return self._condition(*self._measured_distances(world))
 
-    def measured_at(self, world: World, end: End) -> tuple[Condition, ...]:
+    def measured_at(self, world: World, end: End) -> Conditions:
         """Evaluate the distance at the start, where no contact is allowed.
 
         The goal is in contact.
@@ -160,9 +162,9 @@ class PuckContact(Constraint):
             self.contact_range + ADDED_RADIUS_M, self._measured_distances(world)[1]
         )
 
-    def touches(self, tip: Array, scene_values: Array) -> NDArray[np.bool_]:
+    def touches(self, tip: Array, scene_values: Array) -> Mask:
         """Return whether the mallet touches the pucks of ``scene_values`` at N tip positions [m], shape (N, 3)."""
-        touching: NDArray[np.bool_] = (
+        touching: Mask = (
             np.hypot(*(tip[:, :2] - scene_values[:, 2:]).T) < self.contact_range
         )
         return touching
@@ -185,7 +187,7 @@ class PuckContact(Constraint):
         distance = np.hypot(x - center[0], y - center[1])
         return np.asarray(np.maximum(distance - self.last / 2, 0.0))
 
-    def solved(self, world: World) -> tuple[Condition, ...]:
+    def solved(self, world: World) -> Conditions:
         """Return the form for solvers."""
         return self._cone(*self._measured_distances(world), SOLVER_MARGIN_M)
 
@@ -206,13 +208,11 @@ class PuckContact(Constraint):
             if len(world.scene_values)
             else [PUCK_OUT_OF_REACH_M] * self.scene_width
         )
-        (x, y), (goal_x, goal_y, puck_x, puck_y) = (
-            world.parameters.on_table(world.tip_position)[:2],
-            values,
-        )
+        x, y = world.parameters.on_table(world.tip_position)[:2]
+        goal_x, goal_y, puck_x, puck_y = values
         return (x - goal_x) ** 2 + (y - goal_y) ** 2, np.hypot(x - puck_x, y - puck_y)
 
-    def _condition(self, from_goal: Any, distance: Any) -> tuple[Condition, ...]:
+    def _condition(self, from_goal: Any, distance: Any) -> Conditions:
         """State the distance of the centres, larger by a relaxation near the goal.
 
         The relaxation ``h max(1 - rho^2 / (h l), 0)`` at a distance rho from the goal,
@@ -225,9 +225,7 @@ class PuckContact(Constraint):
         relaxation = overlap * _positive_part(1 - from_goal / (overlap * self.last))
         return _at_least(self.contact_range + ADDED_RADIUS_M, distance + relaxation)
 
-    def _cone(
-        self, from_goal: Any, distance: Any, margin: float
-    ) -> tuple[Condition, ...]:
+    def _cone(self, from_goal: Any, distance: Any, margin: float) -> Conditions:
         """State a stricter condition, by a margin [m], that limits all of the last states, not only the first contact.
 
         The relaxation decreases linearly with the distance from the goal, so that a
@@ -295,7 +293,7 @@ def _positive_part(value: Any) -> Any:
     return (value + (value * value + ROUNDING**2) ** 0.5) / 2
 
 
-def _at_least(bound: float, distance: Any) -> tuple[Condition, ...]:
+def _at_least(bound: float, distance: Any) -> Conditions:
     return (
         Condition(
             "puck distance",

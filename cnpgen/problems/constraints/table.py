@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from cnpgen.problems.constraints.constraint import Condition
+from cnpgen.problems.constraints.constraint import Condition, Conditions
 from cnpgen.problems.constraints.tip_manifold import BOUND_KINKS, TipManifold, TipRegion
 from cnpgen.robots.parameter_ranges import TABLE_BOUNDS
 from cnpgen.schema.keys import Range, field
@@ -78,7 +78,7 @@ class Table(TipManifold):
         )
         return [x_low, y_low], [x_high, y_high]
 
-    def judged(self, world: "World") -> tuple[Condition, ...]:
+    def judged(self, world: "World") -> Conditions:
         """Evaluate the tip position with the rectangle of the sample."""
         conditions = self.measured(world)
         values = world.parameters.values

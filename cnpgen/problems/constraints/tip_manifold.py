@@ -14,14 +14,18 @@ from typing import TYPE_CHECKING, Any, ClassVar
 import numpy as np
 
 from cnpgen.arrays import Array
-from cnpgen.problems.constraints.constraint import Condition, Constraint, End
+from cnpgen.problems.constraints.constraint import (
+    Condition,
+    Conditions,
+    Constraint,
+    End,
+)
 from cnpgen.schema.keys import Range
 
 if TYPE_CHECKING:
     from cnpgen.kernels.symbolic.symbolic_state import SymbolicState
     from cnpgen.world.world import World
 
-Vector = tuple[float, float, float]
 Vectors = Sequence[Sequence[float]]  # Python floats, used in scalar products
 # Phases between which a motion that starts off the manifold must reach it.
 BOUND_KINKS = 0.1, 0.3
@@ -85,15 +89,15 @@ class TipManifold(Constraint):
         """Maximum distance of a start from the manifold [m]: the key ``start_band`` of kinds that have it."""
         return float(getattr(self, "start_band", 0.0))
 
-    def symbolic(self, state: "SymbolicState") -> tuple[Condition, ...]:
+    def symbolic(self, state: "SymbolicState") -> Conditions:
         """State the tip position [m]."""
         return self._position(self._symbolic_tip(state), 0.0, state.parameters)
 
-    def measured(self, world: "World") -> tuple[Condition, ...]:
+    def measured(self, world: "World") -> Conditions:
         """Evaluate Pinocchio's tip position [m]."""
         return self._position(self._measured_tip(world), 0.0, world.parameters.values)
 
-    def symbolic_at(self, state: "SymbolicState", end: End) -> tuple[Condition, ...]:
+    def symbolic_at(self, state: "SymbolicState", end: End) -> Conditions:
         """State position, velocity and acceleration of a boundary state."""
         position = self._position(
             self._symbolic_tip(state), self._band_at(end), state.parameters
@@ -106,7 +110,7 @@ class TipManifold(Constraint):
             ),
         )
 
-    def measured_at(self, world: "World", end: End) -> tuple[Condition, ...]:
+    def measured_at(self, world: "World", end: End) -> Conditions:
         """Evaluate position, velocity and acceleration with Pinocchio."""
         position = self._position(
             self._measured_tip(world), self._band_at(end), world.parameters.values
@@ -153,7 +157,7 @@ class TipManifold(Constraint):
 
     def _position(
         self, tip: Sequence[Any], band: float, parameters: Mapping[str, Any]
-    ) -> tuple[Condition, ...]:
+    ) -> Conditions:
         place = self.place
         found = []
         if place.ranges:
@@ -181,7 +185,7 @@ class TipManifold(Constraint):
 
     def _moving(
         self, velocity: Sequence[Any] | Array, acceleration: Sequence[Any] | Array
-    ) -> tuple[Condition, ...]:
+    ) -> Conditions:
         """State that the tip moves along the manifold only."""
         held = self.place.held
         parts = self.parts[1]

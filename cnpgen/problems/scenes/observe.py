@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
 
-from numpy.typing import NDArray
-
+from cnpgen.arrays import Columns
 from cnpgen.errors import UsageError
 from cnpgen.machine.threads import one_thread
 from cnpgen.problems.scenes.scene_problem import SceneProblem
@@ -29,7 +27,7 @@ def observe(
     kind: str | Observation,
     *,
     seed: int = 0,
-) -> dict[str, NDArray[Any]]:
+) -> Columns:
     """Observe N scenes.
 
     Args:

@@ -9,7 +9,7 @@ from dataclasses import replace
 import numpy as np
 
 from cnpgen.arrays import Array
-from cnpgen.errors import listed, nearest
+from cnpgen.errors import UsageError, listed, nearest
 from cnpgen.problems.constraints.constraint import LinkConstraint
 from cnpgen.problems.scenes.quaternions import roll_pitch_yaw
 from cnpgen.problems.scenes.scene_problem import (
@@ -28,6 +28,7 @@ from cnpgen.robots.obstacle import Obstacle
 from cnpgen.robots.robot import Robot
 from cnpgen.robots.shape.convex_part import turned
 from cnpgen.robots.urdf import urdf_tree
+from cnpgen.schema.arguments import numbers
 
 Pose = tuple[Array, Array]  # position [m] and rotation matrix
 
@@ -47,12 +48,17 @@ def placed_scene(scene: SceneProblem, robot: Robot, start: Array) -> SceneProble
 
     Raises:
         SceneError: A frame or a link is unknown.
+        UsageError: The start does not have a finite position of every planned joint.
     """
+    q = numbers("start", start)
+    if q.shape != (robot.n,) or not np.isfinite(q).all():
+        text = f"must have {robot.n} finite joint positions for {scene.place}, got {q.tolist()!r:.80}"
+        raise UsageError(text, argument="start")
     request = scene.request
     _warn_of_another_robot(scene, robot)
     if not request.places:
         return scene
-    frames = LinkFrames(scene, robot, start)
+    frames = LinkFrames(scene, robot, q)
     obstacles, touchable = _placed_obstacles(scene, frames)
     goal = scene.goal_pose
     if goal is not None:

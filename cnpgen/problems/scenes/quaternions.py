@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 
-from cnpgen.arrays import Array
+from cnpgen.arrays import Array, Vector3
 from cnpgen.robots.scene import rotation_matrices
 
 MAX_NORM_ERROR = 0.01  # of a quaternion that is accepted and normalized
@@ -46,7 +46,7 @@ def quaternion_of(rotation: Array) -> Array:
     return wxyz if wxyz[0] >= 0 else -wxyz
 
 
-def roll_pitch_yaw(rotation: Array) -> tuple[float, float, float]:
+def roll_pitch_yaw(rotation: Array) -> Vector3:
     """Return roll, pitch and yaw about fixed axes [rad] of a rotation matrix, as ``<origin rpy>`` of a URDF."""
     # R = Rz(yaw) Ry(pitch) Rx(roll): R_20 = -sin(pitch), and (R_00, R_10) has the
     # length |cos(pitch)|.

@@ -63,8 +63,10 @@ def requested_problem(
         check_range("payload", mass, MIN_PAYLOAD_KG, MAX_PAYLOAD_KG, "kg")
         attached = scenes[0].request.attached
         if all(item.mass or not item.link for item in attached):
-            text = "the payload of %g kg is not used: no scene attaches an object of weight 0"
-            _LOG.warning(text, payload)
+            _LOG.warning(
+                "the payload of %g kg is not used: no scene attaches an object of weight 0",
+                payload,
+            )
     first = scenes[0]
     _report_held_joints(problem, scenes)
     # Plans of one call share limits, links and constraints, hence one problem.

@@ -17,7 +17,7 @@ from cnpgen.problems.scenes.quaternions import (
     rotation_matrix,
 )
 from cnpgen.problems.scenes.scene_request import NO_REQUEST, SceneRequest
-from cnpgen.robots.observation.primitives import KINDS, primitives_of, signed_distances
+from cnpgen.robots.observation.primitives import KINDS, depths_of_origin, primitives_of
 from cnpgen.robots.obstacle import Obstacle, invalid_obstacle
 from cnpgen.robots.shape.hull import MAX_COORDINATE_M, check_solid, hull_corners
 from cnpgen.robots.shape.inline import address_of, is_inline
@@ -243,8 +243,9 @@ def make_mesh(
 
 def _check_shape(argument: str, values: Array, shape: tuple[int, ...]) -> None:
     if values.shape != shape:
-        text = f"must have shape {shape}, got {values.shape}"
-        raise UsageError(text, argument=argument)
+        raise UsageError(
+            f"must have shape {shape}, got {values.shape}", argument=argument
+        )
 
 
 def is_rotation(matrix: Array) -> bool:
@@ -338,13 +339,10 @@ def checked_scene(scene: SceneProblem) -> SceneProblem:
         raise SceneError(f"{scene.place}: {error}")
     # Messages and verdicts name obstacles.
     scene = replace(scene, obstacles=_uniquely_named(scene.obstacles))
-    depths = np.array(
-        [
-            # Poses in frames of links are not known yet.
-            -np.inf if scene.request.frame_of(index) else _depth_of_base(obstacle)
-            for index, obstacle in enumerate(scene.obstacles)
-        ]
-    )
+    bodies = primitives_of(scene.obstacles, place_obstacles(scene.obstacles))
+    # Poses in frames of links are not known yet.
+    relative = [bool(scene.request.frame_of(i)) for i in range(len(scene.obstacles))]
+    depths = np.where(relative, -np.inf, depths_of_origin(bodies))
     if len(depths) and depths.max() > MAX_BASE_DEPTH_M:
         name = scene.obstacles[int(depths.argmax())].name
         depth = float(depths.max())
@@ -353,16 +351,6 @@ def checked_scene(scene: SceneProblem) -> SceneProblem:
             f" expected at most {MAX_BASE_DEPTH_M:g} m: poses are relative to the base"
         )
     return scene
-
-
-def _depth_of_base(obstacle: Obstacle) -> float:
-    """Return the depth of the base, the origin, in an obstacle [m].
-
-    Negative outside.
-    """
-    # The depth is the negative signed distance of the origin.
-    bodies = primitives_of([obstacle], place_obstacles([obstacle]))
-    return -float(signed_distances(bodies, np.zeros((1, 3)))[0, 0])
 
 
 def _uniquely_named(obstacles: tuple[Obstacle, ...]) -> tuple[Obstacle, ...]:

@@ -143,8 +143,10 @@ def _off_table(
     subject = f"{_time_text(table_exit.end, table_exit.time)} the tip"
     distance = f"{1e3 * abs(table_exit.distance):.2g} mm"
     if table_exit.proven:
-        text = f"{subject} is {distance} or more off the table, for any acceleration"
-        return Explanation(Feasibility.INFEASIBLE, text)
+        return Explanation(
+            Feasibility.INFEASIBLE,
+            f"{subject} is {distance} or more off the table, for any acceleration",
+        )
     best = (
         f"has {distance} of the table left"
         if table_exit.distance < 0

@@ -10,9 +10,8 @@ along which ``bound_projection`` proves the violation for the whole box.
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-from cnpgen.arrays import Array
+from cnpgen.arrays import Array, Mask
 from cnpgen.problems.constraints.table import Table
 from cnpgen.problems.problem import Problem
 from cnpgen.refine.proof.reachable_positions import (
@@ -45,7 +44,7 @@ class TableBounds:
 
     normals: Array  # unit vectors, shape (m, 3)
     limits: Array  # limits [m], shape (m,)
-    height: NDArray[np.bool_]  # mask of the rows of the height, shape (m,)
+    height: Mask  # mask of the rows of the height, shape (m,)
 
     def violation(self, tip: Array) -> float:
         """Return the violation by a tip [m].

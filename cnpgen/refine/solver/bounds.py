@@ -14,9 +14,8 @@ from dataclasses import dataclass
 from itertools import accumulate
 
 import numpy as np
-from numpy.typing import NDArray
 
-from cnpgen.arrays import Array
+from cnpgen.arrays import Array, Mask
 from cnpgen.problems.conditions import measured_needs
 from cnpgen.problems.constraints.clearance import RobotClearance
 from cnpgen.problems.constraints.constraint import Condition, Constraint
@@ -76,13 +75,13 @@ class Bounds:
     upper: Array  # upper bounds, shape (K, m)
     # Mask of residuals that change abruptly with the last rate control points, shape
     # (K, m): those of accelerations and jerks at the ends.
-    nonsmooth: NDArray[np.bool_]
+    nonsmooth: Mask
     # Accepted violation between grid points, shape (K, m): that of the verdict, or of a
     # precise plan for equalities; inf where it is unknown.
     interval_tolerance: Array
 
     @property
-    def accelerated(self) -> NDArray[np.bool_]:
+    def accelerated(self) -> Mask:
         """Mask of residuals that depend on accelerations or jerks, shape (m,)."""
         return np.asarray(self.nonsmooth.any(axis=0))
 

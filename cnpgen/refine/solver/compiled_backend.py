@@ -9,9 +9,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from cnpgen.arrays import Array
+from cnpgen.arrays import AnyArray, Array, Mask
 from cnpgen.kernels.compiled_kernel import CACHE_LINE_DOUBLES, address_of, aligned_array
 from cnpgen.kernels.library import KernelLibrary
 from cnpgen.refine.solver.bounds import Bounds
@@ -24,7 +23,6 @@ from cnpgen.refine.solver.qp_subproblem import (
     MIN_MULTIPLIER,
     QP_TOLERANCE,
     THINNING,
-    Mask,
     ResidualSelection,
     Step,
 )
@@ -373,7 +371,7 @@ class CompiledBackend:
         )
         return _Bases(orders, points, *map(self._keep, arrays))
 
-    def _keep(self, array: NDArray[Any]) -> int:
+    def _keep(self, array: AnyArray) -> int:
         array = np.ascontiguousarray(array)
         self._arrays.append(array)
         return address_of(array)

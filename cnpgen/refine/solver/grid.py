@@ -5,13 +5,11 @@ from functools import cached_property, lru_cache
 from itertools import permutations
 
 import numpy as np
-from numpy.typing import NDArray
 
-from cnpgen.arrays import Array
+from cnpgen.arrays import Array, Indices
 from cnpgen.trajectory.spline import basis, basis_tables, chebyshev, graded_edges
 from cnpgen.trajectory.trajectory_spec import TrajectorySpec
 
-Indices = NDArray[np.intp]
 NODES_PER_CELL = 4  # Gauss nodes of the time integral: relative error below 1e-9
 COST_NODES = 40
 # Close enough to 0; jerks there differ by some percent from those at the next grid

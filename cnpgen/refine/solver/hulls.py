@@ -22,7 +22,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from cnpgen.arrays import Array
+from cnpgen.arrays import Array, Mask
 from cnpgen.kernels.collision.collision_checker import MAX_JOINTS, CollisionChecker
 from cnpgen.kernels.collision.row_kernels import DistanceColumns, RowKernels
 from cnpgen.kernels.kernel import Kernel
@@ -168,7 +168,7 @@ class Hulls:
 
     def clear_states(
         self, q: Array, obstacle_poses: Array, *, links_only: bool = False
-    ) -> NDArray[np.bool_]:
+    ) -> Mask:
         """Return a mask of the states q (n, K) with the required distances, of links from each other only or of all."""
         return self.placed_checker(obstacle_poses).clear_states(
             q,

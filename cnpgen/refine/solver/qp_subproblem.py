@@ -13,11 +13,8 @@ constant. ``step.c`` builds the program, and ``active_set.c`` solves it.
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-from cnpgen.arrays import Array
-
-Mask = NDArray[np.bool_]
+from cnpgen.arrays import Array, Mask
 
 # Of the elastic variable's cost; far smaller ones triple the working-set changes.
 ELASTIC_CURVATURE_ROOT = 0.1

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from cnpgen.arrays import Array
+from cnpgen.arrays import Array, JsonObject
 from cnpgen.kernels.symbolic.linalg import symbols
 from cnpgen.kernels.symbolic.symbolic_state import (
     FrozenState,
@@ -98,7 +98,7 @@ class CostTerm:
     terms: tuple[ObjectiveTerm, ...]  # of positive weight
 
     @property
-    def tables(self) -> list[dict[str, Any]]:
+    def tables(self) -> list[JsonObject]:
         """The kinds of the terms with their keys except the weight, JSON-able."""
         return [
             {key: value for key, value in resolved(term).items() if key != "weight"}
@@ -113,25 +113,20 @@ class CostTerm:
         ]
         return np.array(rows, float)
 
-    def rate(self, e: Array, counts: Iterable[int]) -> tuple[Array, Array]:
-        """Evaluate the weighted size rho of the residuals e, shape (m, K), and its curvature.
+    def rate(self, e: Array, counts: Iterable[int]) -> Array:
+        """Evaluate the weighted size rho of the residuals e, shape (m, K): shape (K,).
 
-        ``counts`` are the numbers of residuals of every term. The result is ``(rho,
-        weight)``, shapes (K,) and (m, K): ``weight * e`` is the gradient of rho in e,
-        and the diagonal matrix of ``weight`` bounds its Hessian from above.
+        ``counts`` are the numbers of residuals of every term.
         """
         rho = np.zeros(e.shape[1])
-        weights = np.empty(e.shape)
         first = 0
         for count, smoothing, weight in self.groups(counts).tolist():
             part = slice(first, first := first + int(count))
             squares = np.sum(e[part] * e[part], axis=0)
-            # rho = w (sqrt(e.e + s^2) - s) or w e.e; weights are those of d rho =
-            # weights e . de.
+            # rho = w (sqrt(e.e + s^2) - s) or w e.e
             size = np.sqrt(squares + smoothing**2)
             rho += weight * (size - smoothing if smoothing > 0 else squares)
-            weights[part] = weight / size if smoothing > 0 else 2.0 * weight
-        return rho, weights
+        return rho
 
 
 def choose_cost_term(
@@ -155,7 +150,7 @@ def choose_cost_term(
     return CostTerm(terms) if terms else None
 
 
-def cost_term_residuals(robot: Robot, terms: list[dict[str, Any]]) -> Any:
+def cost_term_residuals(robot: Robot, terms: list[JsonObject]) -> Any:
     """Build ``w -> (e, de/dw)`` of ``CostTerm.tables``, column by column, with ``w = (p, ..., p''', r, r', r'')``."""
     import casadi as ca
 
@@ -178,7 +173,7 @@ def _state(robot: Robot) -> tuple[Any, SymbolicState]:
     return w_sx, SymbolicState(robot, q, dq, ddq, [], (), None, jerk)
 
 
-def _restored(tables: list[dict[str, Any]]) -> list[ObjectiveTerm]:
+def _restored(tables: list[JsonObject]) -> list[ObjectiveTerm]:
     """Return the terms of ``CostTerm.tables``, of weight 1."""
     keys = [
         {key: value for key, value in table.items() if key not in {"source", "package"}}

@@ -36,11 +36,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from cnpgen.arrays import Array
+from cnpgen.arrays import Array, Mask
 from cnpgen.refine.solver.bounds import Bounds
 from cnpgen.refine.solver.compiled_backend import CompiledBackend, CompiledSubproblem
 from cnpgen.refine.solver.qp_subproblem import (
-    Mask,
     ResidualSelection,
     Step,
     local_maxima,

@@ -14,7 +14,8 @@ The objective's Hessian in log R keeps the positive part of that of T,
 
     H = integral of 2 r^-3 (dr/dlog R)(dr/dlog R)' ds,
 
-so that it is positive semidefinite.
+so that it is positive semidefinite. ``step.c`` computes these derivatives, and
+``benchmarks/numpy_transcription.py`` is their reference in NumPy.
 """
 
 from collections.abc import Callable
@@ -24,33 +25,18 @@ from functools import cache
 from typing import Any, TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
 
 from cnpgen.arrays import Array
 from cnpgen.kernels.kernel import Kernel
-from cnpgen.refine.solver.grid import Bases, Grid
+from cnpgen.refine.solver.grid import Grid
 from cnpgen.refine.solver.residuals import CostTerm
-from cnpgen.trajectory.boundary import Boundary, assemble, boundary_derivatives
+from cnpgen.trajectory.boundary import Boundary, assemble
 from cnpgen.trajectory.trajectory_spec import TrajectorySpec
 
-Indices = NDArray[np.intp]
 T = TypeVar("T")
 # Weight of the squared second differences of log r, which selects one of many
 # parametrizations.
 RATE_SMOOTHING = 1e-4
-
-
-@dataclass(frozen=True)
-class Linearization:
-    """Objective and residuals at one x, with their derivatives."""
-
-    x: Array  # variables, shape (nx,)
-    cost: float  # objective [s]
-    gradient: Array  # gradient of the objective, shape (nx,)
-    curvature: Array  # positive semidefinite model of its Hessian, shape (nx, nx)
-    g: Array  # residuals, shape (K, m)
-    jacobian: Array  # d(residuals)/d(w), shape (width of w, m, K)
-    rate: Array  # rate control points, shape (R,)
 
 
 @dataclass(frozen=True)
@@ -93,12 +79,8 @@ class Transcription:
         self.obstacle_poses = obstacle_poses
         self.poses_along = np.repeat(obstacle_poses[:, None], len(grid.s), axis=1)
         self.smoothing = _smoothing(spec.rate_control_points)
-        # An accepted step is evaluated again, with derivatives.
-        self._at = cache_last(self._states)
-        self._cost_residuals = cache_last(self._evaluate_cost_residuals)
-        self._boundary_derivatives = cache_last(
-            lambda rate: boundary_derivatives(boundary, rate[None], spec)
-        )
+        # Values and positions of one step are needed one after the other.
+        self.states = cache_last(self._states)
 
     def activate(self) -> None:
         """Prepare kernels whose machine code has a context.
@@ -126,12 +108,7 @@ class Transcription:
 
     def positions(self, x: Array) -> Array:
         """Return joint positions on the grid [rad], shape (n, K)."""
-        return self._at(x)[0][: self.n]
-
-    def value(self, x: Array) -> tuple[float, Array]:
-        """Evaluate the regularized objective and residuals (K, m), without derivatives."""
-        cost, g = self.measured(x)
-        return cost + self.regularization(x), g
+        return self.states(x)[0][: self.n]
 
     def regularization(self, x: Array) -> float:
         """Return the regularization of log r, which selects one of many equivalent parametrizations."""
@@ -140,7 +117,7 @@ class Transcription:
 
     def measured(self, x: Array) -> tuple[float, Array]:
         """Evaluate ``objective`` and residuals (K, m)."""
-        w, path, rate = self._at(x)
+        w, path, rate = self.states(x)
         (g,) = self.kernels.values(w, self.poses_along)
         return self.objective(path, rate), g.T
 
@@ -169,122 +146,23 @@ class Transcription:
         """Return the objective of a motion [s], from control points (C, n) and (R,): duration and cost term."""
         if self.kernels.cost_term is None:
             return self.duration(rate)
-        e, _, weights = self._cost_residuals(path, rate)
+        assert self.kernels.cost_residuals is not None
+        w = self.grid.cost_bases.states(path, rate)
+        e, _ = self.kernels.cost_residuals(w)
+        rho = self.kernels.cost_term.rate(e, self.kernels.cost_counts)
+        # dt = ds / r: quadrature weights of the phase become those of time.
         return self.duration(rate) + float(
-            weights @ self.kernels.cost_term.rate(e, self.kernels.cost_counts)[0]
+            (self.grid.cost_weights / w[4 * self.n]) @ rho
         )
 
     def duration(self, rate: Array) -> float:
         """Return the motion time [s] of rate control points [1/s], shape (R,)."""
         return float(self.grid.time_weights @ (1.0 / (self.grid.time_basis @ rate)))
 
-    def evaluate(self, x: Array) -> Linearization:
-        """Evaluate objective and residuals with their derivatives."""
-        w, path, rate = self._at(x)
-        g, jacobian = self.kernels.jacobian(w, self.poses_along)
-        log = x[self.split :]
-        # dr/d(log R_j) = B_j R_j at the nodes of the time integral
-        log_rate_derivative = self.grid.time_basis * rate
-        inverse = 1.0 / (self.grid.time_basis @ rate)
-        cost = float(inverse @ self.grid.time_weights) + self.regularization(x)
-        gradient = np.zeros(self.nx)
-        # dT/d(log R) = -sum of weight r^-2 dr/d(log R)
-        gradient[self.split :] = (
-            -((self.grid.time_weights * inverse**2) @ log_rate_derivative)
-            + self.smoothing @ log
-        )
-        curvature = np.zeros((self.nx, self.nx))
-        # H = half' half: a square root, so that one product of matrices builds it
-        half = (
-            log_rate_derivative
-            * np.sqrt(2 * self.grid.time_weights * inverse**3)[:, None]
-        )
-        curvature[self.split :, self.split :] = half.T @ half + self.smoothing
-        if self.kernels.cost_term is not None:
-            cost += self._add_cost_term(path, rate, gradient, curvature)
-        return Linearization(
-            x, cost, gradient, curvature, g.T, jacobian.reshape(len(w), *g.shape), rate
-        )
-
-    def rows(self, at: Linearization, k: Indices, residual: Indices) -> Array:
-        """Return the gradients of residuals with indices (m,) at grid points k, (m,), in the variables: (m, nx)."""
-        return self._chain(at.jacobian[:, residual, k].T, k, at.rate, self.grid.bases)
-
-    def linearization_errors(self, at: Linearization, step: float) -> Array:
-        """Bound the change of residuals by derivatives of r if no log r changes by more than ``step``: (K, m)."""
-        # |r^(i) after - before| <= sum_j |B_j^(i)| R_j step, to first order in the step
-        orders = len(self.grid.bases.path)
-        errors = np.zeros(at.g.shape)
-        for order in range(1, orders - 1):
-            change = np.abs(self.grid.bases.rate[order]) @ at.rate * step
-            errors += np.abs(at.jacobian[orders * self.n + order]).T * change[:, None]
-        return errors
-
     def _states(self, x: Array) -> tuple[Array, Array, Array]:
         """Return w = (p, p', p'', ..., r, r', ...) on the grid, shape (width, K), and the control points."""
         path, rate = self.unpack(x)
         return self.grid.bases.states(path, rate), path, rate
-
-    def _evaluate_cost_residuals(
-        self, path: Array, rate: Array
-    ) -> tuple[Array, Array, Array]:
-        """Return the cost term's residuals (m, Q), their Jacobian (4 n + 3, m, Q) and quadrature weights (Q,)."""
-        assert self.kernels.cost_residuals is not None
-        w = self.grid.cost_bases.states(path, rate)
-        e, jacobian = self.kernels.cost_residuals(w)
-        # dt = ds / r: quadrature weights of the phase become those of time.
-        weights = self.grid.cost_weights / w[4 * self.n]
-        return e, jacobian.reshape(len(w), *e.shape), weights
-
-    def _add_cost_term(
-        self, path: Array, rate: Array, gradient: Array, curvature: Array
-    ) -> float:
-        """Add the cost term's gradient and its Gauss-Newton Hessian.
-
-        Return its value.
-        """
-        assert self.kernels.cost_term is not None
-        bases = self.grid.cost_bases
-        e, jacobian, weights = self._cost_residuals(path, rate)
-        rho, rho_derivative = self.kernels.cost_term.rate(e, self.kernels.cost_counts)
-        m, points = e.shape
-        k = np.repeat(np.arange(points), m)
-        residual = np.tile(np.arange(m), points)
-        rows = self._chain(jacobian[:, residual, k].T, k, rate, bases)
-        row_weights = (weights * rho_derivative)[residual, k]
-        gradient += (row_weights * e[residual, k]) @ rows
-        half = rows * np.sqrt(row_weights)[:, None]
-        # The weights depend on r, too: d(1 / r) = -dr / r^2 with dr = B R d(log R).
-        gradient[self.split :] -= (
-            (weights * rho / (bases.rate[0] @ rate)) @ bases.rate[0] * rate
-        )
-        # A product of one matrix takes half the time.
-        curvature += half.T @ half
-        return float(weights @ rho)
-
-    def _chain(
-        self, state_gradients: Array, k: Indices, rate: Array, bases: Bases
-    ) -> Array:
-        """Convert gradients in w at nodes k, shape (m, width of w), to gradients in the variables, (m, nx)."""
-        n = self.n
-        m = len(k)
-        orders = len(bases.path)
-        # dg/dC = sum over orders of B^(i) dg/dp^(i), for all control points, also those
-        # that the boundary conditions determine
-        control = bases.path_at[k] @ state_gradients[:, : orders * n].reshape(
-            m, orders, n
-        )
-        out = np.empty((m, self.nx))
-        out[:, : self.split] = control[:, 3 : self._goal_points].reshape(m, self.split)
-        out[:, self.split :] = (
-            state_gradients[:, None, orders * n :] @ bases.rate_at[k]
-        )[:, 0] * rate
-        # Boundary control points depend on the first and last rates: chain rule through them.
-        for item in self._boundary_derivatives(rate):
-            out[:, self.split + item.variable] += control[:, item.point] @ (
-                item.derivative[0] * rate[item.variable]
-            )
-        return out
 
 
 @cache

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from cnpgen.arrays import Array
+from cnpgen.arrays import Array, Vector3
 from cnpgen.errors import UsageError
 from cnpgen.schema.argument_types import check_fields
 from cnpgen.schema.arguments import integer
@@ -29,8 +29,8 @@ class Camera:
         field_of_view: Angle between the left and the right edge of the image [rad].
     """
 
-    position: tuple[float, float, float] = (1.3, 0.9, 1.1)
-    target: tuple[float, float, float] = (0.4, 0.0, 0.2)
+    position: Vector3 = (1.3, 0.9, 1.1)
+    target: Vector3 = (0.4, 0.0, 0.2)
     width: int = 160
     height: int = 120
     field_of_view: float = 1.2

@@ -10,7 +10,7 @@ from typing import ClassVar, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from cnpgen.arrays import AnyArray
+from cnpgen.arrays import AnyArray, Columns, Vector3
 from cnpgen.errors import UsageError, nearest
 from cnpgen.robots.observation.camera import Camera
 from cnpgen.robots.observation.primitives import KINDS, MESH, Primitives
@@ -19,7 +19,6 @@ from cnpgen.schema.argument_types import check_fields
 from cnpgen.schema.arguments import integer
 
 Values = NDArray[np.float32]
-Corner = tuple[float, float, float]
 
 MAX_OBSERVED_POINTS = 10_000_000  # of one observation of one scene
 MIN_GRID_EXTENT_M = 1e-6
@@ -68,7 +67,7 @@ class Observation(ABC):
     @abstractmethod
     def observe(
         self, bodies: Primitives, seeds: Seeds, backend: ObservationBackend
-    ) -> dict[str, AnyArray]:
+    ) -> Columns:
         """Observe N scenes from their bodies and seeds, shape (N,): name -> array with a first axis of length N."""
 
 
@@ -89,7 +88,7 @@ class SurfaceCloud(Observation):
 
     def observe(
         self, bodies: Primitives, seeds: Seeds, backend: ObservationBackend
-    ) -> dict[str, AnyArray]:
+    ) -> Columns:
         """See ``Observation``."""
         return {"cloud": backend.surface_points(bodies, self.points, seeds)}
 
@@ -113,7 +112,7 @@ class CameraCloud(Observation):
 
     def observe(
         self, bodies: Primitives, seeds: Seeds, backend: ObservationBackend
-    ) -> dict[str, AnyArray]:
+    ) -> Columns:
         """See ``Observation``."""
         depth = backend.depth_images(bodies, self.camera)
         return {
@@ -132,8 +131,8 @@ class DistanceGrid(Observation):
     """
 
     name = "distances"
-    low: Corner = WORKSPACE[0]
-    high: Corner = WORKSPACE[1]
+    low: Vector3 = WORKSPACE[0]
+    high: Vector3 = WORKSPACE[1]
     shape: tuple[int, int, int] = (32, 32, 32)
 
     def __post_init__(self) -> None:
@@ -153,7 +152,7 @@ class DistanceGrid(Observation):
         bodies: Primitives,
         seeds: Seeds,  # noqa: ARG002
         backend: ObservationBackend,
-    ) -> dict[str, AnyArray]:
+    ) -> Columns:
         """See ``Observation``."""
         axes = [
             np.linspace(*ends)
@@ -175,8 +174,8 @@ class BasisPoints(Observation):
 
     name = "basis"
     points: int = 512
-    low: Corner = WORKSPACE[0]
-    high: Corner = WORKSPACE[1]
+    low: Vector3 = WORKSPACE[0]
+    high: Vector3 = WORKSPACE[1]
 
     def __post_init__(self) -> None:
         check_fields(self)
@@ -198,7 +197,7 @@ class BasisPoints(Observation):
         bodies: Primitives,
         seeds: Seeds,  # noqa: ARG002
         backend: ObservationBackend,
-    ) -> dict[str, AnyArray]:
+    ) -> Columns:
         """See ``Observation``."""
         return {"basis": backend.distances(bodies, self.positions)}
 
@@ -228,7 +227,7 @@ class ObjectTokens(Observation):
         bodies: Primitives,
         seeds: Seeds,  # noqa: ARG002
         backend: ObservationBackend,  # noqa: ARG002
-    ) -> dict[str, AnyArray]:
+    ) -> Columns:
         """See ``Observation``."""
         real = bodies.kinds >= 0
         order = np.argsort(~real, axis=1, kind="stable")  # bodies first
@@ -278,7 +277,7 @@ def as_observation(kind: str | Observation) -> Observation:
     return OBSERVATIONS[kind]()
 
 
-def _check_corners(low: Corner, high: Corner) -> None:
+def _check_corners(low: Vector3, high: Vector3) -> None:
     if not (
         np.isfinite([*low, *high]).all()
         and (np.subtract(high, low) >= MIN_GRID_EXTENT_M).all()

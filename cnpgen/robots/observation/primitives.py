@@ -1,4 +1,4 @@
-"""Obstacles as arrays of boxes, spheres, cylinders, capsules and convex meshes, and signed distances from them."""
+"""Obstacles as arrays of boxes, spheres, cylinders, capsules and convex meshes."""
 
 from __future__ import annotations
 
@@ -6,12 +6,10 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from cnpgen.arrays import Array
+from cnpgen.arrays import AnyArray, Array, Integers
 from cnpgen.errors import UsageError
 from cnpgen.robots.obstacle import Obstacle
 from cnpgen.robots.scene import PARKED_POSITION_M, Scene
@@ -32,7 +30,6 @@ MAX_KEPT_MESHES = 256
 KINDS = ("box", "sphere", "cylinder", "capsule")  # index: the code of a kind
 MESH = len(KINDS)  # the code of the first mesh, followed by those of the others
 NO_BODY = -1  # kind of the padding
-POINTS_PER_CHUNK = 65_536  # keeps the temporary arrays of one primitive in the cache
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,52 +51,6 @@ class ConvexMesh:
     corners: Array
     triangles: Array
     planes: Array
-
-    def distances(self, points: Array) -> Array:
-        """Return the signed distances of points [m], shape (P, 3), negative inside, shape (P,)."""
-        # Inside a hull the largest plane distance is the depth; outside it is a lower
-        # bound.
-        distances: Array = (points @ self.planes[:, :3].T + self.planes[:, 3]).max(
-            axis=1
-        )
-        outside = distances > 0
-        distances[outside] = np.sqrt(self._squared_distances(points[outside]))
-        return distances
-
-    def _squared_distances(self, points: Array) -> Array:
-        """Return squared distances from the nearest triangle."""
-        smallest = np.full(len(points), np.inf)
-        for corner, first, second in self.triangles:
-            normal = np.cross(first, second)
-            # Edges in order around the triangle, so that ``normal x edge`` points
-            # inwards.
-            ends = (
-                (corner, first),
-                (corner + first, second - first),
-                (corner + second, -second),
-            )
-            offsets = [points - start for start, _ in ends]
-            above = [
-                offset @ np.cross(normal, edge) >= 0
-                for offset, (_, edge) in zip(offsets, ends, strict=True)
-            ]
-            # Over the triangle: distance from its plane; else from the nearest edge.
-            to_plane = (offsets[0] @ normal) ** 2 / (normal @ normal)
-            to_edges = [
-                _squared_from_segment(offset, edge)
-                for offset, (_, edge) in zip(offsets, ends, strict=True)
-            ]
-            squared = np.where(
-                np.all(above, axis=0), to_plane, np.min(to_edges, axis=0)
-            )
-            np.minimum(smallest, squared, out=smallest)
-        return smallest
-
-
-def _squared_from_segment(offsets: Array, edge: Array) -> Array:
-    """Return squared distances from a segment of points relative to its start, shape (P,)."""
-    along = np.clip(offsets @ edge / (edge @ edge), 0, 1)
-    return np.asarray(((offsets - along[:, None] * edge) ** 2).sum(axis=1))
 
 
 @lru_cache(MAX_KEPT_MESHES)
@@ -141,7 +92,7 @@ class Primitives:
         meshes: The meshes of all bodies.
     """
 
-    kinds: NDArray[np.int64]
+    kinds: Integers
     centers: Array
     rotations: Array
     sizes: Array
@@ -150,7 +101,7 @@ class Primitives:
     def __len__(self) -> int:
         return len(self.kinds)
 
-    def __getitem__(self, which: int | slice | NDArray[Any]) -> Primitives:
+    def __getitem__(self, which: int | slice | AnyArray) -> Primitives:
         return Primitives(
             self.kinds[which],
             self.centers[which],
@@ -278,7 +229,7 @@ def padded(scenes: Sequence[Primitives]) -> Primitives:
     return Primitives(kinds, centers, rotations, sizes, tuple(meshes))
 
 
-def _padding(*shape: int) -> tuple[NDArray[np.int64], Array, Array, Array]:
+def _padding(*shape: int) -> tuple[Integers, Array, Array, Array]:
     """Return kinds, centers, rotations and sizes of rows of no bodies."""
     centers, sizes = np.zeros((2, *shape, 3))
     return (
@@ -289,46 +240,30 @@ def _padding(*shape: int) -> tuple[NDArray[np.int64], Array, Array, Array]:
     )
 
 
-def signed_distances(primitives: Primitives, points: Array) -> Array:
-    """Compute the signed distances of P world points from M primitives [m], negative inside, shape (M, P)."""
-    distances = np.empty((len(primitives), len(points)))
-    for index in range(len(primitives)):
-        mesh = primitives.mesh(index)
-        kind = int(primitives.kinds[index])
-        size = primitives.sizes[index]
-        # Chunks of points whose temporary arrays fit the cache.
-        for first in range(0, len(points), POINTS_PER_CHUNK):
-            part = slice(first, first + POINTS_PER_CHUNK)
-            local = (points[part] - primitives.centers[index]) @ primitives.rotations[
-                index
-            ]
-            distances[index, part] = (
-                mesh.distances(local) if mesh else _distance(kind, size, local)
-            )
-    return distances
+def depths_of_origin(bodies: Primitives) -> Array:
+    """Return the depth of the origin of the world in each body [m], not above 0 outside; -inf without a body.
 
-
-def _distance(kind: int, size: Array, local: Array) -> Array:
-    """Return the signed distances of points in the frame of a primitive, shape (P,)."""
-    if kind == 0:
-        return _outside_or_inside(np.abs(local) - size)
-    radius = size[0]
-    half = size[1]
-    if kind == 2:
-        radial = np.hypot(local[:, 0], local[:, 1]) - radius
-        return _outside_or_inside(
-            np.stack([radial, np.abs(local[:, 2]) - half], axis=1)
-        )
-    # half is 0 for a sphere
-    along = np.clip(local[:, 2], -half, half)
-    return np.asarray(
-        np.sqrt(local[:, 0] ** 2 + local[:, 1] ** 2 + (local[:, 2] - along) ** 2)
-        - radius
-    )
-
-
-def _outside_or_inside(gaps: Array) -> Array:
-    """Return the distance from a product of intervals, or of a disc and an interval, from the gap along each."""
-    # Outside: length of the vector of positive gaps; inside: the largest, negative gap.
-    outside = np.linalg.norm(np.maximum(gaps, 0), axis=1)
-    return np.asarray(np.where(outside > 0, outside, gaps.max(axis=1)))
+    The shape is that of ``kinds``.
+    """
+    # R^T (0 - c): the origin in the frame of each body; by symmetry of all but meshes
+    # its absolute value decides.
+    origin = -np.einsum("...ji,...j->...i", bodies.rotations, bodies.centers)
+    local = np.abs(origin)
+    across = np.hypot(local[..., 0], local[..., 1])
+    up = local[..., 2]
+    radius = bodies.sizes[..., 0]
+    half = bodies.sizes[..., 1]
+    # Box, sphere, cylinder, capsule, in the order of ``KINDS``; then the meshes, in
+    # which the nearest plane of a face counts.
+    depths = [
+        (bodies.sizes - local).min(axis=-1),
+        radius - np.linalg.norm(local, axis=-1),
+        np.minimum(radius - across, half - up),
+        radius - np.hypot(across, np.maximum(up - half, 0.0)),
+        *(
+            -(origin @ mesh.planes[:, :3].T + mesh.planes[:, 3]).max(axis=-1)
+            for mesh in bodies.meshes
+        ),
+    ]
+    codes = [bodies.kinds == code for code in range(len(depths))]
+    return np.asarray(np.select(codes, depths, -np.inf))

@@ -181,11 +181,13 @@ def _solved(
     """Minimize r + t such that corners are within r of the segment and its ends at most t outside the facets."""
     from scipy.optimize import minimize
 
-    facets, zeros = len(normals), np.zeros_like(normals)
+    facets = len(normals)
+    zeros = np.zeros_like(normals)
     linear = np.block([[-normals, zeros], [zeros, -normals]])
     # Unknowns: both ends (6), radius r and excess t. The facets' constraints are
     # linear.
-    zero, one = np.zeros((2 * facets, 1)), np.ones((2 * facets, 1))
+    zero = np.zeros((2 * facets, 1))
+    one = np.ones((2 * facets, 1))
     facet_gradients = np.concatenate([linear, zero, one], axis=1)
 
     def margins(x: Array) -> Array:

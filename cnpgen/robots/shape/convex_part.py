@@ -6,9 +6,8 @@ from typing import NamedTuple
 from xml.etree import ElementTree
 
 import numpy as np
-from numpy.typing import NDArray
 
-from cnpgen.arrays import Array
+from cnpgen.arrays import Array, Integers
 from cnpgen.errors import RecipeError
 from cnpgen.robots.shape.hull import CUBE, MAX_COORDINATE_M, check_solid
 from cnpgen.robots.shape.inline import corners_of, is_inline
@@ -58,8 +57,8 @@ class Contacts(NamedTuple):
             [m], shape (C, 2, 3).
     """
 
-    pair: NDArray[np.int64]
-    k: NDArray[np.int64]
+    pair: Integers
+    k: Integers
     distance: Array
     normal: Array
     points: Array
@@ -146,7 +145,8 @@ def origin_of(element: ElementTree.Element | None) -> tuple[Array, Array]:
 
 def turned(roll: float, pitch: float, yaw: float) -> Array:
     """Return the rotation by roll about x, then pitch about y, then yaw about z, fixed axes [rad], shape (3, 3)."""
-    (cr, cp, cy), (sr, sp, sy) = np.cos([roll, pitch, yaw]), np.sin([roll, pitch, yaw])
+    cr, cp, cy = np.cos([roll, pitch, yaw])
+    sr, sp, sy = np.sin([roll, pitch, yaw])
     return np.array(
         [
             [cy * cp, cy * sp * sr - sy * cr, cy * sp * cr + sy * sr],

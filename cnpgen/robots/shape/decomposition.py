@@ -15,9 +15,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from cnpgen.arrays import Array
+from cnpgen.arrays import Array, Integers
 from cnpgen.robots.shape.hull import hull_corners
 from cnpgen.store.files.archives import read_arrays
 from cnpgen.store.files.cache_entry import MAX_ENTRY_BYTES, read_entry, write_entry
@@ -37,7 +36,7 @@ class TriangleMesh:
     """Triangles of a mesh or of a part of it: points [m], shape (N, 3), and indices of points, shape (T, 3)."""
 
     points: Array
-    triangles: NDArray[np.int64]
+    triangles: Integers
 
     @property
     def used_points(self) -> Array:
@@ -67,7 +66,7 @@ class _Cut:
 
 
 def convex_parts(
-    points: Array, triangles: NDArray[np.int64], most: int, keep: Path | None
+    points: Array, triangles: Integers, most: int, keep: Path | None
 ) -> list[Array]:
     """Return the corners [m], shape (V, 3), of at most so many convex parts that together cover the surface of a mesh.
 
@@ -92,7 +91,7 @@ def convex_parts(
     return parts
 
 
-def _identity(points: Array, triangles: NDArray[np.int64], most: int) -> str:
+def _identity(points: Array, triangles: Integers, most: int) -> str:
     """Return a digest of the inputs of a decomposition."""
     numbers = b"".join(
         np.ascontiguousarray(each).tobytes()

@@ -6,9 +6,8 @@ from itertools import product
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from cnpgen.arrays import Array
+from cnpgen.arrays import Array, Integers
 from cnpgen.errors import UsageError
 
 if TYPE_CHECKING:
@@ -64,12 +63,12 @@ def hull_corners(points: Array) -> Array:
     return corners
 
 
-def outward_triangles(points: Array) -> NDArray[np.int64]:
+def outward_triangles(points: Array) -> Integers:
     """Return the triangles of the hull of points, shape (V, 3), counterclockwise from outside: indices (T, 3)."""
     from scipy.spatial import ConvexHull
 
     hull = ConvexHull(points)
-    triangles: NDArray[np.int64] = hull.simplices.astype(np.int64)
+    triangles: Integers = hull.simplices.astype(np.int64)
     a, b, c = (points[triangles[:, i]] for i in range(3))
     # Qhull's triangles have either orientation; its facet normals point outwards.
     inwards = np.einsum("fi,fi->f", np.cross(b - a, c - a), hull.equations[:, :3]) < 0

@@ -14,9 +14,8 @@ from typing import TYPE_CHECKING
 from xml.etree import ElementTree
 
 import numpy as np
-from numpy.typing import NDArray
 
-from cnpgen.arrays import Array
+from cnpgen.arrays import Array, Integers
 from cnpgen.errors import RecipeError, nearest
 from cnpgen.robots.shape.decomposition import convex_parts
 from cnpgen.robots.shape.hull import (
@@ -259,7 +258,7 @@ def unit_of_mesh(path: Path) -> float:
         return 1.0
 
 
-def sides_of(mesh: "coal.BVHModelBase") -> NDArray[np.int64]:
+def sides_of(mesh: "coal.BVHModelBase") -> Integers:
     """Return the triangles of a mesh as indices of its points, shape (T, 3)."""
     sides = [mesh.tri_indices(number) for number in range(mesh.num_tris)]
     return np.array([[side[0], side[1], side[2]] for side in sides], np.int64).reshape(

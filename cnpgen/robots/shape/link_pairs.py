@@ -6,9 +6,8 @@ from itertools import combinations, product
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from cnpgen.arrays import Array
+from cnpgen.arrays import Array, Mask
 from cnpgen.robots.shape.capsule import Capsule
 from cnpgen.robots.shape.convex_part import ConvexPart
 from cnpgen.robots.shape.hull import ball_round, coal_hull
@@ -17,7 +16,6 @@ if TYPE_CHECKING:
     import pinocchio as pin
 
 Names = frozenset[str]
-Mask = NDArray[np.bool_]
 
 SAMPLED_STATES = 10_000  # ten times as many gave the same pairs for a Franka Panda
 # Links that overlap in a larger fraction of the states are treated as connected.

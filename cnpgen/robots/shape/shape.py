@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from cnpgen.arrays import Array
+from cnpgen.arrays import Array, JsonObject, Vector3
 from cnpgen.errors import RecipeError, nearest
 from cnpgen.robots.chain import Chain, frame_of
 from cnpgen.robots.robot_spec import HeldObject
@@ -37,7 +37,6 @@ if TYPE_CHECKING:
 Capsules = tuple[Capsule, ...]
 Pairs = tuple[LinkPair, ...]
 Parts = tuple[ConvexPart, ...]
-Size = tuple[float, float, float]
 
 # Of the computation of capsules and pairs; cached results of another revision are
 # ignored.
@@ -200,7 +199,7 @@ def _adjacent(urdf: str, shaped: set[str]) -> frozenset[frozenset[str]]:
     return frozenset(found)
 
 
-def _written(capsules: Capsules, pairs: Pairs) -> dict[str, Any]:
+def _written(capsules: Capsules, pairs: Pairs) -> JsonObject:
     entries = [
         asdict(each) | {"first": each.first.tolist(), "second": each.second.tolist()}
         for each in capsules
@@ -208,7 +207,7 @@ def _written(capsules: Capsules, pairs: Pairs) -> dict[str, Any]:
     return {"capsules": entries, "pairs": [asdict(pair) for pair in pairs]}
 
 
-def _read(content: dict[str, Any], convex_parts: Parts) -> tuple[Capsules, Pairs]:
+def _read(content: JsonObject, convex_parts: Parts) -> tuple[Capsules, Pairs]:
     """Return cached capsules and pairs.
 
     Raise ValueError if a capsule does not cover its link.
@@ -272,7 +271,7 @@ def load_held_shape(
 
 
 def with_held_object(
-    shape: Shape, held: Shape | None, chain: Chain, size: Size
+    shape: Shape, held: Shape | None, chain: Chain, size: Vector3
 ) -> Shape:
     """Return the link geometry of a robot with the held object, of these edge lengths [m], as a further link.
 
@@ -303,7 +302,7 @@ def with_held_object(
     )
 
 
-def _box(size: Size, rotation: Array, translation: Array) -> ConvexPart:
+def _box(size: Vector3, rotation: Array, translation: Array) -> ConvexPart:
     return ConvexPart(HELD_OBJECT, CUBE * np.array(size)).moved(rotation, translation)
 
 

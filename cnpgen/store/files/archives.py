@@ -7,10 +7,10 @@ import tokenize
 import zipfile
 import zlib
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+
+from cnpgen.arrays import AnyArray, Columns
 
 _FAILURES = (  # of NumPy and zipfile for damaged, encrypted and foreign content
     zipfile.BadZipFile, zlib.error, lzma.LZMAError, struct.error, tokenize.TokenError, SyntaxError,
@@ -31,7 +31,7 @@ class ArchiveError(ValueError):
 
 def read_arrays(
     source: Path | bytes, *, max_bytes: int, stored: bool = False
-) -> dict[str, NDArray[Any]]:
+) -> Columns:
     """Read all arrays of an archive.
 
     Args:
@@ -89,7 +89,7 @@ def _size_as_floats(archive: zipfile.ZipFile, member: zipfile.ZipInfo) -> int:
         return size * max(dtype.itemsize, 8)
 
 
-def _read_array(archive: zipfile.ZipFile, member: zipfile.ZipInfo) -> NDArray[Any]:
+def _read_array(archive: zipfile.ZipFile, member: zipfile.ZipInfo) -> AnyArray:
     """Read one array."""
     with archive.open(member) as content:
         return np.asarray(np.lib.format.read_array(content, allow_pickle=False))

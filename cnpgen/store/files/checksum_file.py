@@ -11,11 +11,10 @@ import re
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from cnpgen.arrays import AnyArray
 from cnpgen.errors import DatasetError
 from cnpgen.store.files.atomic import machine_errors, read_file, write_file
 from cnpgen.store.files.hdf5 import create_hdf5, open_hdf5, require_possible_size
@@ -33,7 +32,7 @@ _CHANGED = f"{{}} is damaged: its first {HEADER_BYTES} bytes were changed"
 class Content:
     """Numbers, and texts as UTF-8 bytes, in a file with a checksum, by the name of their dataset."""
 
-    arrays: Mapping[str, NDArray[Any]]
+    arrays: Mapping[str, AnyArray]
     texts: Mapping[str, str]
 
 

@@ -5,8 +5,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
+from cnpgen.arrays import Array
 from cnpgen.errors import DatasetError
 from cnpgen.store.files.size_limits import MAX_TABLE_COLUMNS, MAX_TEXT_TABLE_BYTES
 
@@ -27,7 +27,7 @@ class CsvTable:
         index = self.names.index(name)
         return [row[index].strip() for _, row in self.lines]
 
-    def numbers(self, name: str) -> NDArray[np.float64]:
+    def numbers(self, name: str) -> Array:
         """Return the numbers of a column, shape (rows,).
 
         Other cells raise DatasetError.
@@ -81,6 +81,8 @@ def read_csv_table(path: Path, *, example: str) -> CsvTable:
         raise DatasetError(f"{path}: the column {twice[0]!r} is there more than once")
     for number, row in lines[1:]:
         if len(row) != len(names):
-            text = f"{path}: line {number} has {len(row)} values, the first line names {len(names)} columns"
-            raise DatasetError(text)
+            raise DatasetError(
+                f"{path}: line {number} has {len(row)} values, the first line names {len(names)} "
+                "columns"
+            )
     return CsvTable(path, tuple(names), tuple(lines[1:]))

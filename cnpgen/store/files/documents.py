@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 
+from cnpgen.arrays import JsonMapping, JsonObject
 from cnpgen.errors import DatasetError
 from cnpgen.store.files.atomic import read_file, write_file
 from cnpgen.store.files.document_structure import Structure, check_structure
@@ -118,7 +119,7 @@ def render(value: Any, indent: str = "") -> str:
 
 
 def save_document(
-    path: Path, document: Mapping[str, Any], *, work: Path | None = None
+    path: Path, document: JsonMapping, *, work: Path | None = None
 ) -> None:
     """Write a document with its checksum, atomically.
 
@@ -133,7 +134,7 @@ def save_document(
 
 def load_document(
     path: Path, kind: str, *, version: int, structure: Structure
-) -> dict[str, Any]:
+) -> JsonObject:
     """Read a document with the "format" ``kind``, a "format_version" and a structure, and verify its checksum.
 
     A missing, too large or damaged file, and another format, version or structure,
@@ -204,7 +205,7 @@ def _too_deep() -> ValueError:
     return ValueError(f"it has more than {MAX_DOCUMENT_DEPTH} nested tables and lists")
 
 
-def _parse(path: Path) -> tuple[str, dict[str, Any]]:
+def _parse(path: Path) -> tuple[str, JsonObject]:
     """Read a JSON object; return its text and content."""
     content = read_file(path, max_bytes=MAX_DOCUMENT_BYTES)
     if not content:

@@ -44,8 +44,10 @@ def output_lock(out: Path, lock: Path) -> Iterator[None]:
         # Another process may have removed the file between opening and locking; a lock
         # on it would exclude no other process.
         if not try_lock(file) or not _is_present(file, lock):
-            text = f"another process is writing {out}: wait for it, or choose another {{out}}"
-            raise UsageError(text, remedies={"out": None})
+            raise UsageError(
+                f"another process is writing {out}: wait for it, or choose another {{out}}",
+                remedies={"out": None},
+            )
         try:
             yield
         finally:

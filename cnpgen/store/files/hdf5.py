@@ -16,8 +16,8 @@ from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from cnpgen.arrays import AnyArray
 from cnpgen.errors import DatasetError, MachineError
 from cnpgen.store.files.atomic import machine_error
 from cnpgen.store.files.heaps import check_heaps
@@ -172,7 +172,7 @@ class Column:
         """Size of the numbers in memory [bytes]."""
         return math.prod(self.shape) * self.dtype.itemsize
 
-    def read(self, rows: slice | None = None) -> NDArray[Any]:
+    def read(self, rows: slice | None = None) -> AnyArray:
         """Return the numbers, by default of all rows."""
         from h5py import Dataset
 
@@ -243,6 +243,10 @@ class Hdf5:
             raise DatasetError(f"{self.path}: the texts of {name} must not be packed")
         _check_texts(self.path, name, dataset)
         return _as_texts(Dataset(dataset)[()])
+
+    def attributes_of(self, name: str) -> Attributes:
+        """Return the attributes of a dataset, also of one of texts."""
+        return Attributes(self.path, self._open(name))
 
     def _open(self, name: str) -> Any:
         """Open an object of the file."""
@@ -408,8 +412,9 @@ def _checked_file(path: Path, content: bytes | None) -> Iterator[tuple[Any, int]
         if isinstance(error, OSError) and error.errno in _SYSTEM_ERRORS:
             raise machine_error("read", path, error) from error
         if content is None and not h5py.is_hdf5(path):
-            text = f"{path} is not an HDF5 file, or its beginning is damaged{apparent_kind(path)}"
-            raise DatasetError(text) from error
+            raise DatasetError(
+                f"{path} is not an HDF5 file, or its beginning is damaged{apparent_kind(path)}"
+            ) from error
         raise DatasetError(f"{path} is damaged or cut off: {error}") from error
 
 

@@ -13,6 +13,7 @@ from cnpgen.errors import UsageError
 from cnpgen.plans.plans import Plans
 from cnpgen.problems.problem_record import open_problem
 from tests.addons.benchmark.test_baselines import one_of
+from tests.examples.example_robots import needs_robots
 
 
 def test_projections_reach_the_manifold() -> None:
@@ -73,11 +74,11 @@ def test_drake_returns_valid_hits_and_transports() -> None:
         assert verdict.metrics.duration < (0.4 if suite == "hits-81" else 1.6)
 
 
+@needs_robots
 @pytest.mark.extended
 def test_drake_refuses_problems_without_table_and_boxes(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    pytest.importorskip("example_robot_data")
     problem = one_of("clutter").problem
     monkeypatch.setattr(
         "cnpgen.addons.benchmark.planners.drake.load_drake", lambda: None

@@ -129,6 +129,6 @@ def test_mistakes_are_said_in_a_line(
     assert main(["simulate", str(carried), "--plan", "3"]) == 2
     assert "--plan needs --image or --video" in capsys.readouterr().err
     assert main(["simulate", str(carried), "--plan", "3", "--image", "a.png"]) == 2
-    assert "has no plan 3: 1 plans are numbered from 0" in capsys.readouterr().err
+    assert "has no plan 3: 1 plan, numbered from 0" in capsys.readouterr().err
     assert main(["simulate", str(carried), "--image", "end.jpg"]) == 2
     assert "expected a file that ends in .png, got 'end.jpg'" in capsys.readouterr().err

@@ -9,6 +9,7 @@ import pinocchio as pin
 import pytest
 import scipy  # imports scipy.stats on first access, which takes a second
 from numpy.typing import NDArray
+from train_proposals import likelihood_gradient, save_proposals, train_proposals
 
 from cnpgen.addons.benchmark.benchmark_planner import Setting
 from cnpgen.addons.benchmark.planners.cbirrt import Search
@@ -35,11 +36,8 @@ from cnpgen.addons.benchmark.suite import load_suite
 from cnpgen.addons.paper.proposals import (
     MIN_PROPOSAL_DEVIATION,
     Proposals,
-    likelihood_gradient,
     load_proposals,
-    save_proposals,
     shipped_proposals,
-    train_proposals,
 )
 from cnpgen.addons.trajectories.sampled_trajectory import Trajectory
 from cnpgen.errors import DatasetError, UsageError

@@ -1,7 +1,6 @@
 """Planners in C of all kinds of models: fitted rates, parameters, time scaling, goal accelerations."""
 
 from dataclasses import replace
-from importlib.util import find_spec
 from pathlib import Path
 
 import numpy as np
@@ -30,14 +29,11 @@ from tests.addons.deploy.test_export_planner import (
     requests_of,
 )
 from tests.conftest import some
+from tests.examples.example_robots import needs_robots
 
 pytestmark = [needs_compiler, pytest.mark.slow]
 ROWS = 200
 NEAR_A_LIMIT = 1e-3  # of a limit: there rounding decides which bound is first
-
-_ROBOTS = pytest.mark.skipif(
-    find_spec("example_robot_data") is None, reason="needs cnpgen[robots]"
-)
 
 
 def prepared(
@@ -63,8 +59,8 @@ def prepared(
             ],
             2,
         ),
-        pytest.param("panda-cup", marks=[_ROBOTS, pytest.mark.extended]),
-        pytest.param("ur5-wipe", marks=[_ROBOTS, pytest.mark.extended]),
+        pytest.param("panda-cup", marks=[needs_robots, pytest.mark.extended]),
+        pytest.param("ur5-wipe", marks=[needs_robots, pytest.mark.extended]),
     ],
 )
 def test_plans_of_a_model_equal_those_of_python(model: str, tmp_path: Path):
@@ -85,7 +81,14 @@ def test_plans_of_a_model_equal_those_of_python(model: str, tmp_path: Path):
 @pytest.mark.extended
 @pytest.mark.parametrize(
     "model",
-    ["airhockey-tables", "airhockey-replan", "heavy-object", "heavy-object-loads"],
+    [
+        "airhockey-tables",
+        "airhockey-replan",
+        "heavy-object",
+        "heavy-object-loads",
+        pytest.param("panda-cup", marks=needs_robots),
+        pytest.param("ur5-wipe", marks=needs_robots),
+    ],
 )
 def test_many_plans_of_a_model_equal_those_of_python(model: str, tmp_path: Path):
     planner = Planner(model)

@@ -14,7 +14,7 @@ from cnpgen.pipelines.resting_states import RestingStates
 from cnpgen.pipelines.scene_family import Range
 from cnpgen.problems.load_robot import load_robot
 from cnpgen.problems.problem import Problem
-from cnpgen.robots.observation.primitives import primitives_of, signed_distances
+from cnpgen.robots.observation.primitives import primitives_of
 from cnpgen.robots.obstacle import Obstacle
 from cnpgen.robots.scene import Scene
 from cnpgen.robots.solid import place_obstacles, solids_of
@@ -31,6 +31,7 @@ from cnpgen.scenes import (
 from cnpgen.world.certified import CertifiedDistance, convex_body
 from cnpgen.world.pose_ik import PoseKinematics
 from tests.examples.example_robots import needs_robots
+from tests.examples.numpy_observations import signed_distances
 from tests.examples.scene_arm import write_arm
 
 ENDS_MARGIN = 0.005

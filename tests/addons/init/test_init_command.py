@@ -156,7 +156,7 @@ def test_what_was_found_out_is_said_at_the_top(crane):
     assert re.search(r"swing +revolute +-2.5 to 2.5 +2 +100\n", about)
     for found in (
         "stay at zero: grip",
-        "5 kg in 5 links that move",
+        "5 kg in 5 moving links",
         "claw",
         "overhang [mm]",
     ):

@@ -18,7 +18,7 @@ from cnpgen.problems.problem_file import load_problem
 from cnpgen.robots.robot import Robot
 from cnpgen.robots.robot_spec import LimitSources
 from cnpgen.robots.urdf import urdf_tree
-from cnpgen.robots.urdf_changes import SRDF_NAMES
+from cnpgen.robots.urdf_changes import SRDF_NAMES, with_disabled_pairs
 from cnpgen.robots.urdf_elements import _KNOWN, check_elements, unread_elements
 
 BOX = '<geometry><box size="0.4 0.08 0.08"/></geometry>'
@@ -405,6 +405,91 @@ def test_misspelt_elements_of_a_urdf_are_refused(
     path = write(tmp_path / "a.urdf", **changes)
     with pytest.raises(RecipeError, match=re.escape(text)):
         initial(path)
+
+
+@pytest.mark.parametrize(
+    ("changes", "text"),
+    [
+        (
+            {
+                "upper": UPPER
+                + SHAPE.replace("<geometry>", "<geometry><sphere radius='9'/>")
+            },
+            "a second shape in <geometry>",
+        ),
+        (
+            {
+                "upper": UPPER
+                + SHAPE.replace(
+                    "<geometry>", "<origin/><origin xyz='9 0 0'/><geometry>"
+                )
+            },
+            "a second <origin> in <collision>",
+        ),
+        (
+            {"limit": LIMIT + "<mimic joint='j2'/><mimic joint='j1'/>"},
+            "a second <mimic> in <joint>",
+        ),
+        ({"more": "<axis xyz='0 0 1'/>"}, "<axis> in <robot> (it belongs in <joint>)"),
+        (
+            {"limit": LIMIT.replace("/>", " soft_lower_limit='0'/>")},
+            "'soft_lower_limit' of <limit> (it belongs in <safety_controller>)",
+        ),
+    ],
+)
+def test_repeated_and_misplaced_elements_of_a_urdf_are_refused(
+    tmp_path: Path, changes: dict[str, str], text: str
+) -> None:
+    path = write(tmp_path / "arm.urdf", **changes)
+    with pytest.raises(RecipeError, match=re.escape(text)):
+        initial(path)
+
+
+def test_the_jerk_and_deceleration_of_a_urdf_limit_the_arm(tmp_path: Path) -> None:
+    limit = LIMIT.replace("/>", ' acceleration="8" deceleration="7" jerk="250"/>')
+    path = write(tmp_path / "a.urdf", limit=limit)
+    problem = initial(path).problem
+    robot = load_robot(problem)
+    assert robot.acceleration_limit[0] == 7.0
+    assert robot.jerk_limit[0] == 250.0
+    assert problem.limits.sources.jerk == (
+        "guess: the URDF for j1; 100/s times the acceleration limits for j2"
+    )
+    assert "is not read" not in notes(path)
+    wrong = write(path, limit=limit.replace("deceleration", "deceleraton"))
+    with pytest.raises(RecipeError, match="did you mean 'deceleration'"):
+        initial(wrong)
+
+
+def test_a_follower_needs_a_leader_that_the_urdf_has(tmp_path: Path) -> None:
+    mimic = "<mimic joint='g9' multiplier='-1'/>"
+    path = write(tmp_path / "a.urdf", more=finger() + finger("f2", "g2", mimic=mimic))
+    with pytest.raises(RecipeError, match="<mimic> of 'g2', which names no joint of"):
+        initial(path)
+    initial(path, allow_unused=("mimic",))
+
+
+def test_no_planned_joint_is_passive(tmp_path: Path) -> None:
+    path = write(tmp_path / "a.urdf")
+    srdf = tmp_path / "a.srdf"
+    srdf.write_text("<robot name='arm'><passive_joint name='j2'/></robot>")
+    with_disabled_pairs(path.read_text(), srdf, planned=["j1"])
+    with pytest.raises(
+        RecipeError, match="<passive_joint> names the planned joint 'j2'"
+    ):
+        with_disabled_pairs(path.read_text(), srdf, planned=["j1", "j2"])
+
+
+def test_the_root_of_urdf_and_srdf_is_a_robot(tmp_path: Path) -> None:
+    path = write(tmp_path / "arm.urdf")
+    srdf = tmp_path / "arm.srdf"
+    pair = "<disable_collisions link1='base' link2='upper'/>"
+    groups = "<group name='a'/><group name='b'/>"
+    srdf.write_text(f"<robot name='arm'>{groups}{pair}</robot>")
+    with_disabled_pairs(path.read_text(), srdf)
+    srdf.write_text(f"<robt name='arm'>{pair}</robt>")
+    with pytest.raises(RecipeError, match="its root is <robt>, expected <robot>"):
+        with_disabled_pairs(path.read_text(), srdf)
 
 
 def test_the_loss_of_a_misspelt_element_is_accepted_by_name_and_recorded(

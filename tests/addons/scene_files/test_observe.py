@@ -21,7 +21,7 @@ from cnpgen.robots.observation.observations import (
     Observation,
     ObservationBackend,
 )
-from cnpgen.robots.observation.primitives import KINDS, signed_distances
+from cnpgen.robots.observation.primitives import KINDS
 from cnpgen.robots.observation.surface_points import scene_seeds
 from cnpgen.robots.scene import PARKED_POSITION_M, Scene
 from cnpgen.robots.shape.convex_part import turned
@@ -44,6 +44,7 @@ from tests.examples.numpy_observations import (
     NumpyObservations,
     bodies_of,
     depth_image,
+    signed_distances,
 )
 
 CAMERA = Camera(position=(2.0, 1.0, 1.5), width=64, height=48)

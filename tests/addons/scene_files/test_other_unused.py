@@ -119,6 +119,25 @@ def test_the_world_frame_of_robometrics_is_a_link_of_the_robot(tmp_path: Path) -
 
 
 @needs_robots
+@pytest.mark.parametrize("start", [[], START[:3], [np.nan, *START[1:]]])
+def test_frames_of_links_need_a_start_of_the_robot(
+    tmp_path: Path, start: list[float]
+) -> None:
+    robot = load_robot(load_problem("panda"))
+    scene = load(tmp_path, with_value(("world_frame",), "panda_link3"))
+    text = r"start must have 7 finite joint positions for .*'shelf 0', got \["
+    with pytest.raises(UsageError, match=text):
+        placed_scene(scene, robot, np.array(start))
+
+
+@needs_robots
+def test_an_empty_start_in_a_file_is_refused(tmp_path: Path) -> None:
+    scene = load(tmp_path, with_value(("start",), []) | {"goal_ik": [[]]})
+    with pytest.raises(SceneError, match="has 0 joint positions at the start"):
+        solve_scenes("panda", [scene])
+
+
+@needs_robots
 def test_a_goal_pose_beside_goal_states_is_listed_and_names_a_frame(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:

@@ -335,3 +335,19 @@ def test_options_without_effect_on_samples_are_refused(
     np.savetxt(path, rows, "%.17g", ",", header=head, comments="")
     assert main(["evaluate", str(path), "--problem", "airhockey", *words]) == 2
     assert text in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("name", ["unit", "joint_names", "note"])
+def test_attributes_of_the_names_of_joints_are_refused_or_listed(
+    tmp_path: Path, name: str
+) -> None:
+    path = tmp_path / "a.hdf5"
+    with h5py.File(path, "w") as file:
+        file["t"], file["q"], file["joint_names"] = T, Q, JOINTS
+        file["joint_names"].attrs[name] = "deg"
+    if name == "note":
+        loaded = load_trajectories(path, "airhockey")
+        assert loaded.ignored == ("attribute note of joint_names",)
+        return
+    with pytest.raises(UsageError, match=f"attribute {name} of joint_names"):
+        load_trajectories(path, "airhockey")

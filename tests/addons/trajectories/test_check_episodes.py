@@ -153,6 +153,8 @@ def test_without_a_unit_only_checks_without_units_run(
     assert code == 0
     assert "unit" in found["episodes"][0]["not_run"]["limits"]
     assert "not recorded" in found["episodes"][0]["not_run"]["clock"]
+    assert main(["check-episodes", str(folder)]) == 0
+    assert "set: 1 episode: 1 PASS" in capsys.readouterr().out
 
 
 def test_a_calibration_gives_normalized_values_their_scale(

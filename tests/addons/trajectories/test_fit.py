@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 
 from cnpgen.addons.trajectories.fit import fit_motion, largest_error
+from cnpgen.addons.trajectories.samples import sampled_boundary
 from cnpgen.errors import UsageError
 from cnpgen.trajectory.boundary import Boundary, assemble
-from cnpgen.trajectory.samples import sampled_boundary
 from cnpgen.trajectory.spline_motion import Motion
 from cnpgen.trajectory.trajectory_spec import TrajectorySpec
 from tests.conftest import some

@@ -101,6 +101,19 @@ def test_elements_that_contradict_the_data_are_refused(
         load(tmp_path, change)
 
 
+@pytest.mark.parametrize("delay", [0.0, 1e-4])
+def test_times_of_frames_have_no_rounding_to_float32(
+    tmp_path: Path, delay: float
+) -> None:
+    late = np.where(np.arange(len(T)) == 40, T + delay, T).astype(np.float32)
+    loaded = load(tmp_path, change_columns=lambda c: c.update(timestamp=late))
+    (trajectory,) = loaded.trajectories
+    frames = np.arange(len(T)) / 100
+    # Times beside the frames are read as they are.
+    expected = late.astype(float) if delay else frames
+    assert np.abs(trajectory.t - expected).max() < 1e-15
+
+
 def test_what_is_not_read_is_listed(tmp_path: Path) -> None:
     assert load(tmp_path / "a").ignored == ()
     found = load(

@@ -10,7 +10,9 @@ from cnpgen.addons.trajectories.judge_samples import acceleration_limits
 from cnpgen.addons.trajectories.limited_witness import limited_witness
 from cnpgen.addons.trajectories.sample_errors import SampleErrors, errors_of
 from cnpgen.addons.trajectories.sampled_trajectory import Trajectory
+from cnpgen.addons.trajectories.window_program import TorqueBounds
 from cnpgen.addons.trajectories.witness import MIN_ERRORS, witness
+from cnpgen.arrays import Array
 from cnpgen.plans.exporter import sample_plan
 from tests.examples.plans import load
 
@@ -55,6 +57,31 @@ def test_the_curve_keeps_a_limit_that_the_smoothest_one_exceeds() -> None:
     assert largest_acceleration(smoothest) > 10.05
     assert largest_acceleration(limited) <= limit[0]
     assert is_within(limited, trajectory, errors)
+
+
+def test_the_curve_keeps_a_torque_limit_that_couples_joints() -> None:
+    one = ramp(10.0, 500.0)
+    assert one.dq is not None
+    q, dq = (np.hstack([x, 0.5 * x]) for x in (one.q, one.dq))
+    trajectory = Trajectory(one.t, q, dq)
+    errors = errors_of(trajectory, None, None)
+    mass = np.array([[1.0, 0.4], [0.4, 0.5]])
+
+    def torques(q: Array, dq: Array, ddq: Array) -> Array:
+        return np.asarray(ddq @ mass)
+
+    # 10 + 0.4 * 5 and 0.4 * 10 + 0.5 * 5, with a tolerance
+    limit = np.array([12.0, 6.5]) * 1.004
+    free = np.array([100.0, 100.0])
+    largest = []
+    for bounds in (None, TorqueBounds(torques, limit)):
+        curve = limited_witness(trajectory, errors, free, bounds)
+        assert curve is not None
+        assert is_within(curve, trajectory, errors)
+        ddq = curve.evaluate(FINE, jerk=False).ddq.T
+        largest.append(float((np.abs(ddq @ mass) / limit).max()))
+    assert largest[0] > 1.001
+    assert largest[1] <= 1
 
 
 def test_no_curve_keeps_a_limit_below_the_mean_acceleration() -> None:

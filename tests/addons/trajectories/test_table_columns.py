@@ -356,3 +356,51 @@ def test_names_of_joints_beside_one_dataset_determine_the_order(tmp_path: Path) 
         file["t"], file["q"] = T, Q[:, ::-1]
         file["q"].attrs["joint_names"] = BACKWARDS
     assert np.array_equal(only(tmp_path / "names.h5").q, Q)
+
+
+def unnamed(folder: Path, kind: str) -> Path:
+    """Write a table whose columns name no joints."""
+    path = folder / f"a.{kind}"
+    if kind == "npz":
+        np.savez(path, t=T, q=Q)
+    elif kind == "hdf5":
+        with h5py.File(path, "w") as file:
+            file["t"], file["q"] = T, Q
+    elif kind == "parquet":
+        arrow = pytest.importorskip("pyarrow")
+        columns = {"t": T, "q": arrow.array(Q.tolist())}
+        pytest.importorskip("pyarrow.parquet").write_table(arrow.table(columns), path)
+    else:
+        names = ["t", *NAMES] if kind == "csv" else []
+        np.savetxt(path, np.column_stack([T, Q]), header=" ".join(names), comments="")
+    return path
+
+
+@pytest.mark.parametrize("kind", ["npz", "hdf5", "parquet", "csv", "txt"])
+def test_the_assumed_order_of_columns_without_names_is_stated(
+    kind: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = unnamed(tmp_path, kind)
+    words = ["evaluate", str(path), "--problem", "airhockey"]
+    assert main(words) in {0, 1}
+    text = f"without names of joints are read in the problem's order: {', '.join(BACKWARDS[::-1])}"
+    assert text in capsys.readouterr().err
+    assert main([*words, "--json"]) in {0, 1}
+    assert text in json.loads(capsys.readouterr().out)["notes"][0]
+    # Names that the file does not have would be without effect.
+    assert main([*words, "--joints", ",".join(BACKWARDS)]) == 2
+    assert "--joints must give their numbers" in capsys.readouterr().err
+
+
+def test_columns_with_names_or_stated_numbers_have_no_assumed_order(
+    tmp_path: Path,
+) -> None:
+    np.savez(tmp_path / "a.npz", t=T, q=Q, joint_names=BACKWARDS[::-1])
+    named = table(tmp_path / "a.csv", ["t", *BACKWARDS[::-1]], T, Q)
+    by_number = {"joints": [str(k) for k in range(6)]}
+    for notes in (
+        loaded(tmp_path / "a.npz").notes,
+        loaded(named).notes,
+        loaded(unnamed(tmp_path, "hdf5"), **by_number).notes,
+    ):
+        assert not [note for note in notes if "order" in note]

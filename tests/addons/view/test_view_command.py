@@ -354,7 +354,7 @@ def test_a_row_is_not_shown_with_another_problem(plans, tmp_path, capsys):
 
 def test_a_plan_that_is_not_there_is_refused(plans, capsys):
     assert main(["view", str(plans), "--row", "2"]) == 2
-    assert "has no plan 2: 2 plans are numbered from 0" in capsys.readouterr().err
+    assert "has no plan 2: 2 plans, numbered from 0" in capsys.readouterr().err
 
 
 def test_without_the_viewer_it_is_said_what_to_install(monkeypatch, capsys):
@@ -746,6 +746,9 @@ def test_sampled_trajectories_are_shown_with_their_verdicts(tmp_path, capsys):
             margin.time, abs=1e-9
         )
     assert main([*words[:-4], "--row", "2"]) == 2
-    assert "has no trajectory 2: 2 are numbered from 0" in capsys.readouterr().err
+    assert (
+        "has no trajectory 2: 2 trajectories, numbered from 0"
+        in capsys.readouterr().err
+    )
     assert main(["view", "airhockey", "--unit", "deg"]) == 2
     assert "--unit is for sampled trajectories" in capsys.readouterr().err

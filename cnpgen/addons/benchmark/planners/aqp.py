@@ -23,7 +23,7 @@ from cnpgen.addons.benchmark.simulator.hockey import (
 )
 from cnpgen.addons.benchmark.simulator.tip import Tip
 from cnpgen.addons.trajectories.sampled_trajectory import Trajectory
-from cnpgen.arrays import Array
+from cnpgen.arrays import Array, Vector3
 from cnpgen.errors import UsageError
 from cnpgen.plans.plans import Plans
 from cnpgen.problems.constraints.table import Table
@@ -164,7 +164,8 @@ class _Follower:
         self, q: Array, position: Array, period: float, anchor_velocity: Array
     ) -> Array | None:
         """Return the joint velocity that moves the tip to the sample, closest to the velocity of the anchor."""
-        robot, (tip, _, J) = self._robot, self._tip.at(q)
+        robot = self._robot
+        tip, _, J = self._tip.at(q)
         J = J[:3]
         # Velocity of minimum norm: J^T (J J^T)^-1 v.
         min_norm = J.T @ np.linalg.solve(J @ J.T, (position - tip) / period)
@@ -286,7 +287,7 @@ class PlanePath:
     def _directions(self) -> tuple[Array, Array]:
         return _unit(self.bend - self.start), _unit(self.end - self.bend)
 
-    def _arc(self) -> tuple[float, float, float]:
+    def _arc(self) -> Vector3:
         """Return the distance of the arc's ends from the bend [m], its radius [m] and its angle [rad]."""
         before, after = self._lines()
         one, other = self._directions()

@@ -11,7 +11,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from cnpgen.addons.benchmark.benchmark_planner import (
     Answer,
@@ -23,7 +22,7 @@ from cnpgen.addons.benchmark.benchmark_planner import (
 from cnpgen.addons.benchmark.planners.sst import Tree, tree_of
 from cnpgen.addons.benchmark.planners.state_check import StateCheck
 from cnpgen.addons.paper.proposals import Proposals, load_proposals, shipped_proposals
-from cnpgen.arrays import Array
+from cnpgen.arrays import Array, Integers
 from cnpgen.errors import UsageError
 from cnpgen.plans.plans import Plans
 from cnpgen.problems.problem import Problem
@@ -217,16 +216,15 @@ class Steering:
         high = np.append(self.limit, self.spread.max_duration)
         return np.clip(controls, low, high)
 
-    def integrate(
-        self, state: Array, controls: Array
-    ) -> tuple[Array, Array, NDArray[np.int64]]:
+    def integrate(self, state: Array, controls: Array) -> tuple[Array, Array, Integers]:
         """Integrate controls, accelerations [rad/s^2] and times [s] of shape (N, n + 1), from a state of shape (2 n,).
 
         Return states every ``STEERING_STEP_S``, shape (N, K, 2 n), tip positions [m],
         shape (N, K, 3), and the numbers of states before the first invalid one, shape
         (N,).
         """
-        (q, dq), n = np.split(state, 2), len(self.limit)
+        q, dq = np.split(state, 2)
+        n = len(self.limit)
         ddq = np.repeat(
             controls[:, None, :n],
             round(self.spread.max_duration / STEERING_STEP_S),

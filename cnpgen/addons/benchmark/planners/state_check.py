@@ -3,14 +3,13 @@
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from cnpgen.addons.benchmark.planners.obstacle_boxes import (
     MAX_CORNER_PENETRATION_M,
     MIN_OBJECT_DISTANCE_M,
     require_table_or_transport,
 )
-from cnpgen.arrays import Array
+from cnpgen.arrays import Array, Mask
 from cnpgen.kernels.library import choose_backend, problem_kernels
 from cnpgen.kernels.symbolic.linalg import Scalar, Vec, dot
 from cnpgen.kernels.symbolic.symbolic_state import SymbolicState
@@ -35,7 +34,7 @@ class StateCheck:
 
     def __call__(
         self, q: Array, dq: Array, ddq: Array, obstacle_poses: Array
-    ) -> tuple[Array, NDArray[np.bool_]]:
+    ) -> tuple[Array, Mask]:
         """Check N states of shape (N, n) each among obstacles.
 
         Return positions of the tip [m], shape (N, 3), and a mask of the valid states,

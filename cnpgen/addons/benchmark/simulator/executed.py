@@ -3,16 +3,14 @@
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from cnpgen.addons.benchmark.simulator import hockey
 from cnpgen.addons.benchmark.simulator.reference import TICK_S, Reference
 from cnpgen.addons.benchmark.simulator.simulator_scene import SimulatorScene
 from cnpgen.addons.benchmark.simulator.tip import Tip
-from cnpgen.arrays import Array
+from cnpgen.arrays import Array, JsonMapping, JsonObject, Mask
 from cnpgen.judges.plans.metrics import tilt
 
 # Of the mallet's height, as in the Air Hockey Challenge (2023).
@@ -91,11 +89,11 @@ class Executed:
         """Whether the task succeeded with the default tolerance; see ``succeeded``."""
         return succeeded(self._values())
 
-    def to_dict(self) -> dict[str, Any]:
+    def to_dict(self) -> JsonObject:
         """Return the result for JSON in the units of the paper's tables, without inapplicable values."""
         return {**self._values(), "success": self.success}
 
-    def _values(self) -> dict[str, Any]:
+    def _values(self) -> JsonObject:
         values = {
             **{
                 name: getattr(self, name)
@@ -130,7 +128,7 @@ class Executed:
 
 
 def succeeded(
-    executed: Mapping[str, Any], plane_tolerance: float = PLANE_TOLERANCE_M
+    executed: JsonMapping, plane_tolerance: float = PLANE_TOLERANCE_M
 ) -> bool:
     """Return whether an execution succeeded, from the result of ``Executed.to_dict``.
 
@@ -174,7 +172,7 @@ class TickRecord:
     torque_use: Array
     puck: Array
     puck_velocity: Array
-    puck_contact: NDArray[np.bool_]
+    puck_contact: Mask
     table_force: Array
     max_penetration: float = 0.0
     violated_steps: Mapping[str, int] | None = None

@@ -4,9 +4,8 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-from cnpgen.arrays import Array
+from cnpgen.arrays import Array, Integers
 from cnpgen.errors import UsageError
 from cnpgen.trajectory.spline_motion import Motion
 
@@ -35,7 +34,7 @@ class Reference:
         """Number of ticks within the plan, including its end."""
         return int(np.ceil(self.duration / TICK_S)) + 1
 
-    def at(self, ticks: int | NDArray[np.int64]) -> tuple[Array, Array, Array]:
+    def at(self, ticks: int | Integers) -> tuple[Array, Array, Array]:
         """Return positions, velocities and accelerations at a tick, shape (n,) each, or at K ticks, shape (K, n)."""
         last = len(self.q) - 1
         rows = np.minimum(ticks, last)

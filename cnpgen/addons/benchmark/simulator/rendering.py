@@ -63,7 +63,7 @@ def save_film(
     options = (
         {"duration": 1000 / FILM_FRAMES_PER_S, "loop": 0}
         if path.suffix == ".gif"
-        else {"fps": FILM_FRAMES_PER_S, "macro_block_size": 1}
+        else {"format": "FFMPEG", "fps": FILM_FRAMES_PER_S, "macro_block_size": 1}
     )
     try:
         imageio.mimsave(path, images, **options)
@@ -105,10 +105,8 @@ def _renderer(execution: Execution) -> Iterator[Callable[[int], Image]]:
     data = mujoco.MjData(model)
     camera = mujoco.MjvCamera()
     view = OBJECT_VIEW if scene.height is None else HOCKEY_VIEW
-    camera.lookat[:], (camera.distance, camera.azimuth, camera.elevation) = (
-        view[:3],
-        view[3:],
-    )
+    camera.lookat[:] = view[:3]
+    camera.distance, camera.azimuth, camera.elevation = view[3:]
 
     def draw(tick: int) -> Image:
         data.qpos[:] = execution.states[tick]

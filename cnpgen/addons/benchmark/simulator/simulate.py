@@ -5,7 +5,6 @@ from contextlib import closing
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -21,7 +20,7 @@ from cnpgen.addons.benchmark.simulator.reference import (
 )
 from cnpgen.addons.benchmark.simulator.simulator_scene import SimulatorScene
 from cnpgen.addons.benchmark.simulator.tip import Tip
-from cnpgen.arrays import Array
+from cnpgen.arrays import Array, JsonObject
 from cnpgen.errors import UsageError, counted
 from cnpgen.machine.workers import distribute, worker_count
 from cnpgen.plans.plans import Plans
@@ -55,7 +54,7 @@ class Simulation:
         plans = f"{counted(len(self.executed), 'plan')} of {self.plans.problem.name!r}"
         return f"<{plans} executed by the {self.plant.name} plant, {succeeded:,} with success>"
 
-    def summary(self) -> dict[str, Any]:
+    def summary(self) -> JsonObject:
         """Return the summary of all plans for JSON."""
         rows = [result.to_dict() for result in self.executed]
         counts = {
@@ -203,10 +202,8 @@ def simulator_scene(problem: Plans, plant: Plant) -> SimulatorScene:
     if scene.height is None:
         return scene
     if "puck_xy" in problem.columns:
-        puck, (vx, vy) = (
-            problem.columns["puck_xy"][0],
-            problem.columns["puck_velocity"][0].tolist(),
-        )
+        puck = problem.columns["puck_xy"][0]
+        vx, vy = problem.columns["puck_velocity"][0].tolist()
         return replace(scene, puck=puck, puck_velocity=(vx, vy))
     velocity = (
         Tip(robot).at(problem.boundary.goal_q[0])[2][:3] @ problem.boundary.goal_dq[0]

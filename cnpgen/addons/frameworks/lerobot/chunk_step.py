@@ -87,16 +87,20 @@ class ChunkStep(ProcessorStep):  # type: ignore[misc] # LeRobot has no types
                 f"must be {either(tuple(RADIANS))}, got {unit!r}", argument="unit"
             )
         if "speed" in options:
-            text = "chunks keep their own timing here; ChunkExecutor has other speeds"
-            raise UsageError(text, argument="speed")
+            raise UsageError(
+                "chunks keep their own timing here; ChunkExecutor has other speeds",
+                argument="speed",
+            )
         self._config = {"problem": str(problem), "unit": unit, **options}
         rest = ChunkOptions(stop_after=_time_to_rest(**options))
         self._executor = ChunkExecutor(problem, **options, options=rest)
         n = len(as_record(problem).joint_names)
         self._zero = np.zeros(n) if zero is None else numbers("zero", zero)
         if self._zero.shape != (n,) or not np.isfinite(self._zero).all():
-            text = f"must be finite and have shape ({n},), got {zero!r:.100}"
-            raise UsageError(text, argument="zero")
+            raise UsageError(
+                f"must be finite and have shape ({n},), got {zero!r:.100}",
+                argument="zero",
+            )
         self._factor = RADIANS[unit]
         self._clock = clock
         self._times = np.arange(options["length"]) / options["rate"]

@@ -66,13 +66,15 @@ class TensorBoundaryLayer:
         Raises:
             UsageError: A shape is wrong.
         """
-        phi, log_rate = real_tensor("phi", phi), real_tensor("log_rate", log_rate)
+        phi = real_tensor("phi", phi)
+        log_rate = real_tensor("log_rate", log_rate)
         self.layer.check_shapes(tasks, tuple(phi.shape), tuple(log_rate.shape))
         kind = {
             "device": phi.device,
             "dtype": torch.promote_types(phi.dtype, torch.float32),
         }
-        spec, conditions = self.layer.problem.trajectory, tasks.boundary.conditions()
+        spec = self.layer.problem.trajectory
+        conditions = tasks.boundary.conditions()
         state = {
             name: torch.tensor(values, **kind) for name, values in conditions.items()
         }

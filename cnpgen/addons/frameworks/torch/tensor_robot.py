@@ -10,7 +10,7 @@ import torch
 
 from cnpgen.addons.frameworks.torch.tensor_tape import TensorTape
 from cnpgen.addons.frameworks.torch.torch_plans import real_tensor
-from cnpgen.errors import UsageError
+from cnpgen.errors import UsageError, counted
 from cnpgen.kernels.library import choose_backend, problem_kernels
 from cnpgen.problems.load_robot import load_robot
 from cnpgen.problems.problem import Problem
@@ -47,7 +47,7 @@ class TensorRobot:
         self._tapes = dict[Callable[..., Any], TensorTape]()
 
     def __repr__(self) -> str:
-        return f"<TensorRobot of {self.problem.name!r}: {len(self.model.joint_names)} joints>"
+        return f"<TensorRobot of {self.problem.name!r}: {counted(len(self.model.joint_names), 'joint')}>"
 
     def forward_kinematics(self, q: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         """Compute positions [m], shape (N, 3), and rotation matrices, shape (N, 3, 3), of the tip."""

@@ -8,7 +8,7 @@ from typing import Any
 import torch
 from torch.utils import data
 
-from cnpgen.errors import UsageError
+from cnpgen.errors import UsageError, counted
 from cnpgen.loader.batch import Batch
 from cnpgen.loader.batches import Batches
 from cnpgen.loader.row_format import Columns, Normalization
@@ -88,7 +88,7 @@ class TensorBatch(dict[str, torch.Tensor]):
 
     def __repr__(self) -> str:
         kind = f"{self.table.dtype} on {self.table.device}"
-        return f"<batch of {len(self.table)} rows, {kind}: {self.layout.summary}>"
+        return f"<batch of {counted(len(self.table), 'row')}, {kind}: {self.layout.summary}>"
 
 
 def to_torch(batch: Batch) -> TensorBatch:
