@@ -1,7 +1,5 @@
-"""Types of arrays, tables and documents; shapes and units are in the docstrings of functions."""
+"""Types of arrays; shapes and units are in the docstrings of functions."""
 
-from collections.abc import Iterator, Mapping
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -27,24 +25,3 @@ Indices = NDArray[np.intp]
 
 Columns = dict[str, AnyArray]
 """The columns of N rows by their names, shape (N, width) or (N,) each."""
-
-JsonObject = dict[str, Any]
-"""A table of a JSON or TOML document: name -> text, number, bool, None, list or table."""
-
-JsonMapping = Mapping[str, Any]
-"""A table of a JSON or TOML document that is only read."""
-
-TextRows = list[tuple[str, ...]]
-"""The cells of the rows of a printed table."""
-
-NamedErrors = Iterator[tuple[str, str]]
-"""(name, error) pairs of the keys of a table, or of the arguments of a call."""
-
-Names = tuple[str, ...]
-"""Names of joints, columns, links or keys, in their order."""
-
-AnyPath = str | Path
-"""A path of a file or folder, as a caller may pass it."""
-
-NamedNumbers = Mapping[str, float]
-"""Numbers by the names of joints, links or parameters."""

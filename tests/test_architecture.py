@@ -20,7 +20,7 @@ PACKAGE = Path(__file__).parents[1] / "cnpgen"
 
 # Layers of packages, lowest first, as in architecture.md: a package imports packages of lower layers only.
 LAYERS = (
-    ("errors", "arrays"),
+    ("errors", "arrays", "documents"),
     ("schema", "store"),
     ("machine", "robots", "trajectory"),
     ("kernels", "world"),

@@ -11,10 +11,10 @@ import argparse
 import sys
 from typing import TYPE_CHECKING
 
-from cnpgen.arrays import TextRows
 from cnpgen.cli import recipe_names, values
 from cnpgen.cli.parser import Parser, add_json
 from cnpgen.cli.terminal import table
+from cnpgen.documents import TextRows
 
 if TYPE_CHECKING:
     from cnpgen.store.field import Field

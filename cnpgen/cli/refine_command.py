@@ -14,7 +14,6 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from cnpgen.arrays import JsonObject
 from cnpgen.cli import recipe_names, values
 from cnpgen.cli.interruption import resumable
 from cnpgen.cli.parser import (
@@ -28,6 +27,7 @@ from cnpgen.cli.parser import (
 )
 from cnpgen.cli.terminal import Meter
 from cnpgen.cli.verdict_text import checksum_text
+from cnpgen.documents import JsonObject
 from cnpgen.errors import UsageError, counted
 
 if TYPE_CHECKING:

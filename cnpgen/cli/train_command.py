@@ -16,11 +16,11 @@ import textwrap
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from cnpgen.arrays import JsonMapping
 from cnpgen.cli import recipe_names, values
 from cnpgen.cli.parser import Parser, options_of
 from cnpgen.cli.terminal import LINE_WIDTH, Meter
 from cnpgen.cli.train_options import add_settings, changed_settings, passed_settings
+from cnpgen.documents import JsonMapping
 from cnpgen.errors import MachineError, counted
 
 if TYPE_CHECKING:

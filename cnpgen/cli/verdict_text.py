@@ -9,8 +9,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from cnpgen.arrays import JsonMapping, JsonObject, TextRows
 from cnpgen.cli.terminal import table
+from cnpgen.documents import JsonMapping, JsonObject, TextRows
 from cnpgen.errors import counted
 
 if TYPE_CHECKING:

@@ -11,7 +11,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from cnpgen.arrays import JsonMapping, JsonObject
+from cnpgen.documents import JsonMapping, JsonObject
 from cnpgen.errors import PluginError, RecipeError, UsageError
 from cnpgen.pipelines.pipeline import Pipeline, listed_tasks, read_pipeline
 from cnpgen.pipelines.stages.stage import Stage

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from cnpgen.arrays import JsonObject
+from cnpgen.documents import JsonObject
 from cnpgen.errors import UsageError
 from cnpgen.kernels.library import choose_backend
 from cnpgen.machine.versions import versions

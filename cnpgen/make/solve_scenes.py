@@ -10,7 +10,8 @@ from typing import Any
 
 import numpy as np
 
-from cnpgen.arrays import Array, JsonObject, Mask
+from cnpgen.arrays import Array, Mask
+from cnpgen.documents import JsonObject
 from cnpgen.errors import UsageError, counted
 from cnpgen.machine.engine import Engine
 from cnpgen.machine.times import NO_TIME, Times

@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 
-from cnpgen.arrays import JsonMapping, NamedErrors
+from cnpgen.documents import JsonMapping, NamedErrors
 from cnpgen.errors import PluginError, RecipeError, UsageError
 from cnpgen.pipelines.stages.draw_scenes import DrawScenes
 from cnpgen.pipelines.stages.stage import Context, Stage, StageFunction

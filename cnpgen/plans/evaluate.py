@@ -11,7 +11,8 @@ from typing import Any, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from cnpgen.arrays import JsonObject, Mask
+from cnpgen.arrays import Mask
+from cnpgen.documents import JsonObject
 from cnpgen.errors import UsageError, counted
 from cnpgen.judges.plans import Reason, Verdict, judge, summarize_verdicts
 from cnpgen.judges.plans.judge import check_step

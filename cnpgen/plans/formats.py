@@ -12,7 +12,8 @@ from typing import Any
 
 import numpy as np
 
-from cnpgen.arrays import AnyArray, Array, Integers, JsonObject
+from cnpgen.arrays import AnyArray, Array, Integers
+from cnpgen.documents import JsonObject
 from cnpgen.errors import UsageError, requires_extra
 from cnpgen.plans.exporter import ExportedSet, Exporter, SampledPlan, parameter_columns
 from cnpgen.plans.format import JOINT_NAMES_KEY, PHASE_COLUMN, PLAN_COLUMN

@@ -12,7 +12,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from cnpgen.arrays import AnyArray, Array, Integers, NamedErrors
+from cnpgen.arrays import AnyArray, Array, Integers
+from cnpgen.documents import NamedErrors
 from cnpgen.errors import UsageError, counted
 from cnpgen.plans.format import FLOATS, INTEGERS, NOTES, PlanStatus
 from cnpgen.plans.plausible import check_boundary_units

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree
 
-from cnpgen.arrays import JsonObject
+from cnpgen.documents import JsonObject
 from cnpgen.errors import PluginError, RecipeError, listed, nearest
 from cnpgen.problems.constraints.constraint import Constraint
 from cnpgen.problems.constraints.link_clearance import ObjectClearance

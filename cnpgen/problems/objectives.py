@@ -10,7 +10,7 @@ from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, ClassVar
 
-from cnpgen.arrays import NamedErrors
+from cnpgen.documents import NamedErrors
 from cnpgen.errors import RecipeError, UsageError, nearest
 from cnpgen.schema import registry
 from cnpgen.schema.arguments import concerning

@@ -12,7 +12,8 @@ from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 
-from cnpgen.arrays import Array, JsonMapping, JsonObject, NamedErrors, Vector3
+from cnpgen.arrays import Array, Vector3
+from cnpgen.documents import JsonMapping, JsonObject, NamedErrors
 from cnpgen.errors import MachineError, UsageError
 from cnpgen.problems.constraints.axis import TipAxis
 from cnpgen.problems.constraints.clearance import ObjectContact, RobotClearance

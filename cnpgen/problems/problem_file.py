@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from cnpgen.arrays import JsonObject
+from cnpgen.documents import JsonObject
 from cnpgen.errors import PluginError, RecipeError
 from cnpgen.problems.checks import ProblemTables, limit_errors, problem_errors, tables
 from cnpgen.problems.constraints.constraint import Constraint

@@ -15,7 +15,8 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 from numpy.typing import ArrayLike
 
-from cnpgen.arrays import Array, JsonObject
+from cnpgen.arrays import Array
+from cnpgen.documents import JsonObject
 from cnpgen.errors import RecipeError, UsageError, counted
 from cnpgen.problems.objectives import read_objective
 from cnpgen.problems.problem import (

@@ -2,7 +2,7 @@
 
 from dataclasses import asdict, dataclass
 
-from cnpgen.arrays import JsonObject
+from cnpgen.documents import JsonObject
 from cnpgen.errors import UsageError
 from cnpgen.problems.objectives import read_objective
 from cnpgen.refine.solver.sqp import DEFAULT_SETTINGS

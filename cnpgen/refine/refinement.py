@@ -8,7 +8,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from cnpgen.arrays import Array, JsonObject, Mask
+from cnpgen.arrays import Array, Mask
+from cnpgen.documents import JsonObject
 from cnpgen.errors import counted
 from cnpgen.machine.times import NO_TIME, Times
 from cnpgen.plans.plans import Plans

@@ -11,7 +11,8 @@ from functools import cached_property
 
 import numpy as np
 
-from cnpgen.arrays import Array, NamedErrors
+from cnpgen.arrays import Array
+from cnpgen.documents import NamedErrors
 from cnpgen.errors import counted
 from cnpgen.robots.parameter_ranges import optional_key
 from cnpgen.schema.keys import PerJoint, field

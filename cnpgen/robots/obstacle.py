@@ -4,7 +4,8 @@ import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
-from cnpgen.arrays import NamedErrors, Vector3
+from cnpgen.arrays import Vector3
+from cnpgen.documents import NamedErrors
 from cnpgen.robots.parameter_ranges import optional_key
 from cnpgen.robots.shape.hull import MAX_COORDINATE_M, check_solid
 from cnpgen.robots.shape.inline import corners_of, is_inline

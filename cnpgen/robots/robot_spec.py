@@ -8,7 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from cnpgen.arrays import NamedErrors, Vector3
+from cnpgen.arrays import Vector3
+from cnpgen.documents import NamedErrors
 from cnpgen.robots.parameter_ranges import PAYLOAD_CENTRE, optional_key
 from cnpgen.schema.keys import PerJoint, Range, field
 

@@ -9,7 +9,7 @@ from functools import cache
 from types import UnionType
 from typing import Any, Union, get_args, get_origin, get_type_hints
 
-from cnpgen.arrays import JsonObject
+from cnpgen.documents import JsonObject
 from cnpgen.schema.units import dimension, show
 
 

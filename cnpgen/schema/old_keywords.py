@@ -5,7 +5,7 @@ import warnings
 from collections.abc import Mapping
 from typing import Any, TypeVar
 
-from cnpgen.arrays import NamedErrors
+from cnpgen.documents import NamedErrors
 
 Options = TypeVar("Options")
 

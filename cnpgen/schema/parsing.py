@@ -9,7 +9,7 @@ from contextvars import ContextVar
 from dataclasses import MISSING, dataclass
 from typing import Any, NoReturn, TypeVar, get_args, get_origin
 
-from cnpgen.arrays import JsonObject
+from cnpgen.documents import JsonObject
 from cnpgen.errors import nearest
 from cnpgen.schema.keys import Key, PerJoint, Range, RecipeLocation, keys
 from cnpgen.schema.old_keywords import errors_of

@@ -5,7 +5,7 @@ import tomllib
 from pathlib import Path
 from typing import Literal
 
-from cnpgen.arrays import JsonObject
+from cnpgen.documents import JsonObject
 from cnpgen.schema.texts import read_at_most, utf8_text
 
 Kind = Literal["problem", "pipeline", "dataset", "suite"]

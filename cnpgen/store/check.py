@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from cnpgen.arrays import JsonObject
+from cnpgen.documents import JsonObject
 from cnpgen.errors import DatasetError
 from cnpgen.store.checked_shard import Shard, read_rows
 from cnpgen.store.dataset_spec import (

@@ -13,7 +13,7 @@ from functools import cached_property
 from itertools import pairwise
 from pathlib import Path
 
-from cnpgen.arrays import JsonMapping, JsonObject
+from cnpgen.documents import JsonMapping, JsonObject
 from cnpgen.errors import DatasetError, UsageError, nearest
 from cnpgen.store.field import Field, Fields
 from cnpgen.store.files.atomic import read_file

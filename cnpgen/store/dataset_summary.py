@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 
-from cnpgen.arrays import JsonObject
+from cnpgen.documents import JsonObject
 from cnpgen.errors import DatasetError
 from cnpgen.store.dataset_spec import DatasetSpec, ShardTask, shards
 from cnpgen.store.files.document_structure import ANY_KEY, TEXT

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 
-from cnpgen.arrays import JsonObject
+from cnpgen.documents import JsonObject
 from cnpgen.errors import DatasetError
 from cnpgen.store.check import check_documents
 from cnpgen.store.dataset_spec import DatasetSpec, load_dataset_spec, shards

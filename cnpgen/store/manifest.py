@@ -12,7 +12,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import cast
 
-from cnpgen.arrays import JsonObject
+from cnpgen.documents import JsonObject
 from cnpgen.errors import DatasetError, UsageError
 from cnpgen.store.dataset_document import DatasetDocument
 from cnpgen.store.dataset_spec import DatasetSpec, shards

@@ -7,7 +7,8 @@ from pathlib import Path
 
 import numpy as np
 
-from cnpgen.arrays import AnyArray, Columns, JsonObject
+from cnpgen.arrays import AnyArray, Columns
+from cnpgen.documents import JsonObject
 from cnpgen.errors import DatasetError, lacks
 from cnpgen.store.checked_shard import Shard, read_rows, read_scenes
 from cnpgen.store.dataset_spec import DatasetSpec, ShardTask, load_dataset_spec, shards

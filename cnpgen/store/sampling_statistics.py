@@ -9,7 +9,8 @@ from functools import reduce
 
 import numpy as np
 
-from cnpgen.arrays import Integers, JsonMapping, JsonObject
+from cnpgen.arrays import Integers
+from cnpgen.documents import JsonMapping, JsonObject
 from cnpgen.errors import DatasetError
 from cnpgen.store.files.document_structure import ANY_KEY, NUMBER, TEXT, WHOLE
 from cnpgen.store.files.documents import plain

@@ -13,7 +13,8 @@ from dataclasses import dataclass, fields
 
 import numpy as np
 
-from cnpgen.arrays import AnyArray, Indices, Integers, JsonObject
+from cnpgen.arrays import AnyArray, Indices, Integers
+from cnpgen.documents import JsonObject
 from cnpgen.errors import DatasetError
 from cnpgen.store.field import Field
 

@@ -13,7 +13,8 @@ from typing import Any
 
 import numpy as np
 
-from cnpgen.arrays import AnyArray, Columns, JsonObject
+from cnpgen.arrays import AnyArray, Columns
+from cnpgen.documents import JsonObject
 from cnpgen.errors import DatasetError, nearest
 from cnpgen.store.field import Field
 from cnpgen.store.files.atomic import committing

@@ -4,7 +4,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, fields
 from pathlib import Path
 
-from cnpgen.arrays import AnyArray, JsonMapping, JsonObject
+from cnpgen.arrays import AnyArray
+from cnpgen.documents import JsonMapping, JsonObject
 from cnpgen.errors import CnpgenError, DatasetError
 from cnpgen.store.dataset_spec import DatasetSpec, ShardTask, shard_attributes, shards
 from cnpgen.store.files.atomic import file_sha256

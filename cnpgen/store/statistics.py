@@ -8,7 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from cnpgen.arrays import AnyArray, Integers, JsonMapping, JsonObject, Mask
+from cnpgen.arrays import AnyArray, Integers, Mask
+from cnpgen.documents import JsonMapping, JsonObject
 from cnpgen.errors import DatasetError
 from cnpgen.store.field import Field
 from cnpgen.store.files.document_structure import NUMBER, WHOLE, check_structure

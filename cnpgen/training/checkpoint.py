@@ -8,7 +8,8 @@ from pathlib import Path
 
 import numpy as np
 
-from cnpgen.arrays import AnyArray, JsonMapping, JsonObject, Mask
+from cnpgen.arrays import AnyArray, Mask
+from cnpgen.documents import JsonMapping, JsonObject
 from cnpgen.errors import DatasetError, UsageError
 from cnpgen.store.files.checksum_file import (
     Content,

@@ -10,7 +10,8 @@ from pathlib import Path
 
 import numpy as np
 
-from cnpgen.arrays import Array, JsonObject
+from cnpgen.arrays import Array
+from cnpgen.documents import JsonObject
 from cnpgen.errors import DatasetError, UsageError
 from cnpgen.loader.dataset import Dataset
 from cnpgen.loader.load import load_dataset

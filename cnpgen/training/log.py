@@ -4,7 +4,7 @@ import json
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from cnpgen.arrays import JsonMapping, JsonObject
+from cnpgen.documents import JsonMapping, JsonObject
 from cnpgen.errors import UsageError
 from cnpgen.store.files.atomic import committing, write_file
 from cnpgen.store.files.documents import parse_json

@@ -10,7 +10,8 @@ from functools import partial
 
 import numpy as np
 
-from cnpgen.arrays import AnyArray, JsonObject
+from cnpgen.arrays import AnyArray
+from cnpgen.documents import JsonObject
 from cnpgen.errors import UsageError
 from cnpgen.losses.margins import Margins, suggested_margins
 from cnpgen.losses.metric import Metric, suggested_weights

@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from cnpgen.arrays import JsonMapping, JsonObject
+from cnpgen.documents import JsonMapping, JsonObject
 from cnpgen.errors import DatasetError, UsageError
 from cnpgen.machine.threads import one_thread
 from cnpgen.machine.times import NO_TIME, Stopwatch, Times

@@ -6,7 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
-from cnpgen.arrays import JsonMapping
+from cnpgen.documents import JsonMapping
 from cnpgen.schema.argument_types import check_fields
 
 

@@ -6,7 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from cnpgen.arrays import AnyArray, JsonMapping, JsonObject
+from cnpgen.arrays import AnyArray
+from cnpgen.documents import JsonMapping, JsonObject
 from cnpgen.errors import MachineError
 from cnpgen.losses.metric import Metric
 from cnpgen.losses.plan_loss import PlanLoss

@@ -14,7 +14,7 @@ from collections.abc import Callable
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 
-from cnpgen.arrays import JsonObject
+from cnpgen.documents import JsonObject
 from cnpgen.errors import PluginError, counted
 from cnpgen.machine.threads import users_environment
 from cnpgen.machine.versions import installed_version, processor_entry

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from cnpgen.arrays import JsonObject
+from cnpgen.documents import JsonObject
 from cnpgen.errors import DatasetError, MachineError, UsageError, counted
 from cnpgen.judges.rows.row_report import RowReport
 from cnpgen.kernels.library import Backend, choose_backend

@@ -483,7 +483,7 @@ def test_soft_limits_that_are_zero_or_absent_are_none(
         (
             "<safety_controller",
             '<dynamics damping="1"/><dynamics damping="2"/><safety_controller',
-            "2 elements <dynamics>",
+            "a second <dynamics> in <joint>",
         ),
         ('velocity="2"', 'velocity="2" acceleration="-4"', "must not be negative"),
     ],

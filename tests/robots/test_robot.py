@@ -257,6 +257,11 @@ def test_joints_need_a_range_to_move_in(tmp_path, old, new, found):
 
 FINGER = """
 <link name="finger"/>
+<link name="other"/>
+<joint name="other_finger" type="prismatic">
+  <parent link="link_7"/><child link="other"/><axis xyz="0 0 1"/>
+  <limit lower="0" upper="0.1" effort="1" velocity="1"/>
+</joint>
 <joint name="finger_joint" type="prismatic">
   <parent link="link_7"/><child link="finger"/><axis xyz="0 0 1"/>
   <limit lower="0" upper="0.1" effort="1" velocity="1"/><mimic joint="{other}" multiplier="1" offset="{offset}"/>

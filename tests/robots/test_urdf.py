@@ -118,10 +118,10 @@ def test_what_is_no_file_is_not_read(tmp_path: Path, what: str) -> None:
 def test_an_offset_with_a_comma_is_no_number(tmp_path: Path) -> None:
     mimic = '<mimic joint="other" offset="0,5"/>'
     finger = f'<link name="f"/><joint name="finger" type="revolute"><parent link="iiwa_link_1"/><child link="f"/>{LIMIT}'
+    other = finger.replace('"f"', '"o"').replace('"finger"', '"other"')
     link = PROBLEMS["heavy-object"].urdf_text.split('<link name="')[1].split('"')[0]
-    urdf = shipped_with(
-        ("</robot>", f"{finger.replace('iiwa_link_1', link)}{mimic}</joint></robot>")
-    )
+    joints = f"{other}</joint>{finger}{mimic}</joint>".replace("iiwa_link_1", link)
+    urdf = shipped_with(("</robot>", f"{joints}</robot>"))
     with pytest.raises(
         RecipeError,
         match=r"'finger' mimics 'other' with <mimic offset='0,5'> must be a number",

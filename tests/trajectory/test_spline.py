@@ -150,8 +150,7 @@ def test_chebyshev_points_are_dense_at_both_ends() -> None:
 def test_the_trajectory_does_not_import_scipy() -> None:
     """Its import takes longer than most commands."""
     modules = ", ".join(
-        f"cnpgen.trajectory.{name}"
-        for name in ("spline", "boundary", "spline_motion", "samples")
+        f"cnpgen.trajectory.{name}" for name in ("spline", "boundary", "spline_motion")
     )
     evaluate = "cnpgen.trajectory.spline.basis(numpy.linspace(0, 1, 9), 15, 7, 2)"
     code = f"import sys, numpy, {modules}; {evaluate}; sys.exit('scipy' in sys.modules)"

@@ -22,7 +22,8 @@ from cnpgen.addons.trajectories.interpolate import interpolated
 from cnpgen.addons.trajectories.judge_family import FamilyJudge
 from cnpgen.addons.trajectories.sampled_trajectory import Trajectory
 from cnpgen.addons.trajectories.trajectory_verdict import ConditionDecision, Decision
-from cnpgen.arrays import Array, JsonObject
+from cnpgen.arrays import Array
+from cnpgen.documents import JsonObject
 from cnpgen.errors import UsageError
 from cnpgen.judges.plans.evaluated_trajectory import EvaluatedTrajectory
 from cnpgen.judges.plans.judge import reason_of

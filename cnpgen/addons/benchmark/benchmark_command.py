@@ -17,7 +17,6 @@ from dataclasses import asdict, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from cnpgen.arrays import JsonObject
 from cnpgen.cli import recipe_names, values
 from cnpgen.cli.interruption import resumable
 from cnpgen.cli.parser import (
@@ -30,6 +29,7 @@ from cnpgen.cli.parser import (
     refuse_others,
 )
 from cnpgen.cli.terminal import Meter, table
+from cnpgen.documents import JsonObject
 from cnpgen.errors import CnpgenError, UsageError, counted
 
 if TYPE_CHECKING:

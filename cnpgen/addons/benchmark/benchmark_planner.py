@@ -9,7 +9,8 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from cnpgen.addons.trajectories.sampled_trajectory import Trajectory
-from cnpgen.arrays import Array, JsonMapping
+from cnpgen.arrays import Array
+from cnpgen.documents import JsonMapping
 from cnpgen.errors import UsageError
 from cnpgen.plans.plans import Plans
 from cnpgen.problems.problem import Problem

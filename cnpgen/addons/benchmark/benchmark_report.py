@@ -18,7 +18,8 @@ from cnpgen.addons.benchmark.result_tables import failure_summaries, notes, tabl
 from cnpgen.addons.benchmark.run_suite import Benchmark
 from cnpgen.addons.benchmark.simulator.plant import Plant
 from cnpgen.addons.benchmark.simulator.rendering import save_film, save_picture
-from cnpgen.arrays import Array, JsonObject
+from cnpgen.arrays import Array
+from cnpgen.documents import JsonObject
 from cnpgen.errors import CnpgenError, MachineError, counted
 from cnpgen.schema.argument_types import checked_arguments
 from cnpgen.store.files.atomic import write_file

@@ -12,7 +12,8 @@ from typing import Any
 import numpy as np
 
 from cnpgen.addons.benchmark.simulator.executed import PLANE_TOLERANCE_M, succeeded
-from cnpgen.arrays import Array, JsonMapping, JsonObject
+from cnpgen.arrays import Array
+from cnpgen.documents import JsonMapping, JsonObject
 
 FLAGS = {  # of a row; those from "at the goal, executed" on need an execution
     "planned": "a plan was found",

@@ -16,7 +16,7 @@ from typing import Any
 from cnpgen.addons.benchmark.benchmark_planner import Plan, Setting, load_planner
 from cnpgen.addons.benchmark.results_file import answer_from_dict, answer_to_dict
 from cnpgen.addons.trajectories.sampled_trajectory import Trajectory
-from cnpgen.arrays import JsonObject
+from cnpgen.documents import JsonObject
 from cnpgen.errors import CnpgenError, MachineError, UsageError
 from cnpgen.machine.threads import one_thread
 from cnpgen.plans.plans import Plans

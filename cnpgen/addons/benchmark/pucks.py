@@ -11,7 +11,8 @@ from pathlib import Path
 
 import numpy as np
 
-from cnpgen.arrays import Array, NamedErrors
+from cnpgen.arrays import Array
+from cnpgen.documents import NamedErrors
 from cnpgen.errors import RecipeError
 from cnpgen.make.complete import complete
 from cnpgen.pipelines.pipeline import Pipeline

@@ -16,7 +16,7 @@ from cnpgen.addons.benchmark.hypothesis_tests import (
     values_of,
 )
 from cnpgen.addons.benchmark.run_suite import Benchmark
-from cnpgen.arrays import JsonMapping, JsonObject, TextRows
+from cnpgen.documents import JsonMapping, JsonObject, TextRows
 from cnpgen.errors import counted
 from cnpgen.schema.argument_types import checked_arguments
 from cnpgen.store.files.atomic import write_file

@@ -16,7 +16,7 @@ from cnpgen.addons.benchmark.benchmark_planner import PLANNERS, Setting
 from cnpgen.addons.benchmark.hypothesis_tests import FIGURES
 from cnpgen.addons.benchmark.suite import Suite
 from cnpgen.addons.trajectories.sampled_trajectory import Trajectory
-from cnpgen.arrays import JsonObject
+from cnpgen.documents import JsonObject
 from cnpgen.errors import DatasetError, UsageError
 from cnpgen.machine.versions import __version__, installed_version
 from cnpgen.plans.plans import Plans, make_plans

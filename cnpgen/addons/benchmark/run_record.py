@@ -8,7 +8,7 @@ from dataclasses import asdict, dataclass
 from datetime import UTC, datetime
 from pathlib import Path
 
-from cnpgen.arrays import JsonObject
+from cnpgen.documents import JsonObject
 from cnpgen.errors import DatasetError
 from cnpgen.machine.versions import installed_version, processor_entry, versions
 from cnpgen.store.files.atomic import read_file, write_file

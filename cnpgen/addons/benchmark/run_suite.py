@@ -30,7 +30,7 @@ from cnpgen.addons.benchmark.simulator.execute import load_mujoco
 from cnpgen.addons.benchmark.simulator.executed import PLANE_TOLERANCE_M
 from cnpgen.addons.benchmark.simulator.plant import Plant, as_plant
 from cnpgen.addons.benchmark.suite import PlannerFields, Suite, load_suite
-from cnpgen.arrays import JsonMapping, JsonObject
+from cnpgen.documents import JsonMapping, JsonObject
 from cnpgen.errors import RecipeError, UsageError, counted
 from cnpgen.judges.plans.verdict import Verdict
 from cnpgen.machine.engine import Engine, WorkerPool, assembled

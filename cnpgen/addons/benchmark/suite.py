@@ -15,7 +15,7 @@ from cnpgen.addons.benchmark.pucks import (
     scenario_problems,
 )
 from cnpgen.addons.scene_files.scene_files import load_scenes
-from cnpgen.arrays import JsonObject, NamedErrors
+from cnpgen.documents import JsonObject, NamedErrors
 from cnpgen.errors import CnpgenError, nearest
 from cnpgen.make.draw_boundary_problems import draw_boundary_problems
 from cnpgen.make.recipe import load_dataset_recipe

@@ -15,10 +15,10 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from cnpgen.arrays import JsonObject
 from cnpgen.cli import recipe_names, values
 from cnpgen.cli.parser import Parser, add_json, refuse_others
 from cnpgen.cli.terminal import Meter
+from cnpgen.documents import JsonObject
 from cnpgen.errors import RecipeError, UsageError, counted
 
 if TYPE_CHECKING:

@@ -10,7 +10,8 @@ from pathlib import Path
 import numpy as np
 from numpy.random import Generator
 
-from cnpgen.arrays import Array, JsonMapping
+from cnpgen.arrays import Array
+from cnpgen.documents import JsonMapping
 from cnpgen.errors import RecipeError, UsageError, nearest
 from cnpgen.pipelines.resting_states import RestingStates, seeds_of
 from cnpgen.pipelines.scene_family import Grasp, Layout, SceneFamily

@@ -13,7 +13,7 @@ from cnpgen.addons.hub.card_problem import (
     what_samples_prove,
 )
 from cnpgen.addons.hub.markdown import markdown_table
-from cnpgen.arrays import JsonMapping, TextRows
+from cnpgen.documents import JsonMapping, TextRows
 from cnpgen.problems.constraints.joint import judged_torque
 from cnpgen.problems.problem_record import as_record, open_problem
 from cnpgen.robots.drive import RIGID

@@ -9,7 +9,7 @@ also listed as ``variableMeasured`` of schema.org, which Croissant documents may
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
-from cnpgen.arrays import JsonObject
+from cnpgen.documents import JsonObject
 from cnpgen.store.dataset_summary import DatasetSummary
 from cnpgen.store.field import Field
 from cnpgen.store.scene_table import SCENE_ARRAYS

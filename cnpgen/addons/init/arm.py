@@ -12,7 +12,7 @@ from xml.etree.ElementTree import Element
 import numpy as np
 
 from cnpgen.addons.init.doubts import doubts
-from cnpgen.arrays import NamedNumbers, Names
+from cnpgen.documents import NamedNumbers, Names
 from cnpgen.errors import RecipeError, UsageError, listed
 from cnpgen.problems.checks import frames_of, missing_frame, unread_xacro
 from cnpgen.problems.urdf_dynamics import (

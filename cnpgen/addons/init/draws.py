@@ -5,7 +5,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from cnpgen.arrays import Array, Mask, Names
+from cnpgen.arrays import Array, Mask
+from cnpgen.documents import Names
 from cnpgen.errors import RecipeError
 from cnpgen.kernels.library import choose_backend
 from cnpgen.pipelines.pipeline import Pipeline

@@ -17,7 +17,8 @@ from cnpgen.addons.init.stated_sources import (
     TORQUE_STATES,
     stated_sources,
 )
-from cnpgen.arrays import Array, Names
+from cnpgen.arrays import Array
+from cnpgen.documents import Names
 from cnpgen.errors import RecipeError
 from cnpgen.make.recipe import DatasetRecipe
 from cnpgen.pipelines.pipeline import Pipeline

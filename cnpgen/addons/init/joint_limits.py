@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from cnpgen.addons.init.arm import Arm, ArmJoint
-from cnpgen.arrays import NamedNumbers, Names
+from cnpgen.documents import NamedNumbers, Names
 from cnpgen.errors import UsageError, nearest
 from cnpgen.problems.scenes.yaml_document import read_yaml
 

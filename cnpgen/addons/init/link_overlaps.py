@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 from itertools import takewhile
 
 from cnpgen.addons.init.hull_gap import GAP_STATES, HullGap, PairGap, measure_hull_gap
-from cnpgen.arrays import Names
+from cnpgen.documents import Names
 from cnpgen.errors import listed
 from cnpgen.problems.load_robot import load_robot
 from cnpgen.problems.problem import Problem

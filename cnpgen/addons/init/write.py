@@ -14,8 +14,8 @@ from cnpgen.addons.init.link_overlaps import MAX_PAIR_GAP, LinkOverlaps
 from cnpgen.addons.init.stated_sources import INITIAL_JERK_RATE, PLACEHOLDERS
 from cnpgen.addons.manual.describe import link_rows, pair_rows, with_units
 from cnpgen.addons.manual.describe_keys import GROUPS, is_array, kind_summary, part_of
-from cnpgen.arrays import JsonMapping, JsonObject, Names, TextRows
 from cnpgen.cli.terminal import table
+from cnpgen.documents import JsonMapping, JsonObject, Names, TextRows
 from cnpgen.errors import counted
 from cnpgen.make.recipe import DatasetRecipe
 from cnpgen.problems.load_robot import load_robot

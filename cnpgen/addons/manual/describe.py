@@ -5,8 +5,8 @@ from collections.abc import Sequence
 from textwrap import wrap
 from typing import Any
 
-from cnpgen.arrays import JsonObject, TextRows
 from cnpgen.cli.terminal import LINE_WIDTH, table
+from cnpgen.documents import JsonObject, TextRows
 from cnpgen.make.any_recipe import Recipe
 from cnpgen.make.recipe import DatasetRecipe, recipe_digest
 from cnpgen.pipelines.pipeline import Pipeline

@@ -5,8 +5,8 @@ from collections.abc import Sequence
 from typing import get_args
 
 from cnpgen.addons.manual.describe import quantity, title_lines
-from cnpgen.arrays import JsonObject
 from cnpgen.cli.terminal import table
+from cnpgen.documents import JsonObject
 from cnpgen.make.recipe import DatasetRecipe
 from cnpgen.pipelines.pipeline import Pipeline
 from cnpgen.pipelines.stages.stage import Stage

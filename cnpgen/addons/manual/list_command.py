@@ -3,9 +3,9 @@
 import argparse
 from pathlib import Path
 
-from cnpgen.arrays import JsonObject
 from cnpgen.cli.parser import Parser, add_json
 from cnpgen.cli.terminal import table
+from cnpgen.documents import JsonObject
 from cnpgen.errors import RecipeError, counted
 from cnpgen.schema.toml import Kind
 

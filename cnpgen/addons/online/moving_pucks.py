@@ -23,7 +23,8 @@ from cnpgen.addons.online.hit_tasks import (
     lanes,
     state_lanes,
 )
-from cnpgen.arrays import Array, Indices, Mask, Names
+from cnpgen.arrays import Array, Indices, Mask
+from cnpgen.documents import Names
 from cnpgen.errors import UsageError
 from cnpgen.pipelines.completion import Completion
 from cnpgen.pipelines.stages.stage import TaskBatch

@@ -17,7 +17,8 @@ from cnpgen.addons.online.hit_tasks import (
     load_completion,
 )
 from cnpgen.addons.online.moving_pucks import MovingHits, PuckModel, plan_moving_hits
-from cnpgen.arrays import Array, Mask, Names
+from cnpgen.arrays import Array, Mask
+from cnpgen.documents import Names
 from cnpgen.errors import UsageError, counted
 from cnpgen.judges.plans.judge import Judge
 from cnpgen.machine.threads import one_thread

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from cnpgen.addons.scene_files.document_values import part, scalar
-from cnpgen.arrays import Names
+from cnpgen.documents import Names
 from cnpgen.problems.scenes.scene_problem import SceneError
 from cnpgen.store.files.accounted import AccountedMapping
 

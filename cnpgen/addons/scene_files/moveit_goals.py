@@ -16,7 +16,8 @@ from cnpgen.addons.scene_files.moveit_frames import (
     rotation_of,
 )
 from cnpgen.addons.scene_files.moveit_shapes import read_regions
-from cnpgen.arrays import Array, NamedNumbers, Names
+from cnpgen.arrays import Array
+from cnpgen.documents import NamedNumbers, Names
 from cnpgen.problems.scenes.scene_problem import GoalPose, SceneError
 
 _PARAMETRIZATIONS = {"0": EULER, "XYZ_EULER_ANGLES": EULER}

@@ -24,7 +24,7 @@ from cnpgen.addons.scene_files.moveit_shapes import (
     read_shapes,
     shape_poses,
 )
-from cnpgen.arrays import Names
+from cnpgen.documents import Names
 from cnpgen.problems.scenes.scene_problem import SceneError, check_count
 from cnpgen.problems.scenes.scene_request import AttachedObject
 

@@ -48,7 +48,7 @@ from cnpgen.addons.scene_files.moveit_path import read_path_constraints
 from cnpgen.addons.scene_files.moveit_shapes import built
 from cnpgen.addons.scene_files.moveit_unused import UNUSED_ELEMENTS
 from cnpgen.addons.scene_files.octomap import read_octomap
-from cnpgen.arrays import JsonMapping, NamedNumbers, Names
+from cnpgen.documents import JsonMapping, NamedNumbers, Names
 from cnpgen.errors import listed, nearest
 from cnpgen.problems.scenes.scene_problem import (
     MAX_SCENE_OBSTACLES,

@@ -20,7 +20,7 @@ from cnpgen.addons.scene_files.robometrics_scenes import (
     is_robometrics,
     read_robometrics,
 )
-from cnpgen.arrays import AnyPath, JsonObject, NamedNumbers
+from cnpgen.documents import AnyPath, JsonObject, NamedNumbers
 from cnpgen.errors import UsageError, listed
 from cnpgen.problems.scenes.scene_problem import (
     MAX_SCENES,

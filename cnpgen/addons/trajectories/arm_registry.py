@@ -12,7 +12,8 @@ from importlib.resources import files
 
 import numpy as np
 
-from cnpgen.arrays import Array, JsonMapping, JsonObject, Names
+from cnpgen.arrays import Array
+from cnpgen.documents import JsonMapping, JsonObject, Names
 from cnpgen.errors import UsageError, either, nearest
 
 BY_POSITION = "slope", "offset", "lower_end", "upper_end"  # of velocity limits

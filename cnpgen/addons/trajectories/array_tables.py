@@ -10,7 +10,7 @@ import numpy as np
 from cnpgen.addons.trajectories.load_options import LoadOptions
 from cnpgen.addons.trajectories.table_units import plain
 from cnpgen.addons.trajectories.trajectory_table import TrajectoryTable, Values
-from cnpgen.arrays import Names
+from cnpgen.documents import Names
 from cnpgen.errors import UsageError
 from cnpgen.plans.format import PHASE_COLUMN
 from cnpgen.plans.stated_units import UNIT_ATTRIBUTES

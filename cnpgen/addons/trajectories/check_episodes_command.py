@@ -12,9 +12,9 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from cnpgen.arrays import Names
 from cnpgen.cli import values
 from cnpgen.cli.parser import Parser, refuse
+from cnpgen.documents import Names
 from cnpgen.errors import UsageError, counted, listed
 
 if TYPE_CHECKING:

@@ -11,7 +11,8 @@ import numpy as np
 
 from cnpgen.addons.trajectories.sample_errors import SampleErrors
 from cnpgen.addons.trajectories.sampled_trajectory import Trajectory
-from cnpgen.arrays import Array, Names
+from cnpgen.arrays import Array
+from cnpgen.documents import Names
 
 CONTRADICTION = "velocities are not the derivative of the positions"
 EXPLAINED_SHARE = 0.3  # of the difference, that may remain after a correction

@@ -31,7 +31,8 @@ from cnpgen.addons.trajectories.lower_bounds import (
 )
 from cnpgen.addons.trajectories.sample_errors import rounding, time_rounding
 from cnpgen.addons.trajectories.velocity_by_position import span_limits
-from cnpgen.arrays import Array, JsonObject
+from cnpgen.arrays import Array
+from cnpgen.documents import JsonObject
 from cnpgen.errors import counted
 
 NOMINAL_LAGS = (

@@ -20,7 +20,8 @@ from cnpgen.addons.trajectories.lerobot_tables import (
 from cnpgen.addons.trajectories.parquet_tables import read_parquet
 from cnpgen.addons.trajectories.table_units import plain, stated_factor
 from cnpgen.addons.trajectories.trajectory_tables import read_trajectory_tables
-from cnpgen.arrays import Array, Integers, Names
+from cnpgen.arrays import Array, Integers
+from cnpgen.documents import Names
 from cnpgen.errors import DatasetError, UsageError, counted, listed
 from cnpgen.store.files.documents import parse_json
 from cnpgen.store.files.hdf5 import open_nested_hdf5

@@ -21,11 +21,11 @@ from cnpgen.addons.trajectories.trajectory_options import (
     summary_text,
     write_json,
 )
-from cnpgen.arrays import Names
 from cnpgen.cli import values
 from cnpgen.cli.evaluate_command import refuse_without_effect
 from cnpgen.cli.parser import Options, refuse
 from cnpgen.cli.terminal import Meter
+from cnpgen.documents import Names
 from cnpgen.errors import UsageError, counted
 
 if TYPE_CHECKING:

@@ -32,7 +32,8 @@ from cnpgen.addons.trajectories.trajectory_verdict import (
     Statement,
     TrajectoryVerdict,
 )
-from cnpgen.arrays import Array, JsonObject, Mask
+from cnpgen.arrays import Array, Mask
+from cnpgen.documents import JsonObject
 from cnpgen.errors import UsageError, counted
 from cnpgen.judges.plans.judge import check_step
 from cnpgen.plans.evaluate import MAX_VERDICT_STEP_S, judged_in_parts

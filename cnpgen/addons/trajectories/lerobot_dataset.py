@@ -20,7 +20,7 @@ from cnpgen.addons.trajectories.lerobot_tables import (
     LEROBOT_INFO,
     LEROBOT_STATE,
 )
-from cnpgen.arrays import JsonObject
+from cnpgen.documents import JsonObject
 from cnpgen.errors import UsageError, requires_extra
 from cnpgen.plans.exporter import ExportedSet, Exporter, SampledPlan
 from cnpgen.plans.formats import fixed_lists, write_parquet

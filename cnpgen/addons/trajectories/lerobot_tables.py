@@ -15,7 +15,7 @@ from cnpgen.addons.trajectories.trajectory_table import (
     TrajectoryTable,
     Values,
 )
-from cnpgen.arrays import JsonMapping, JsonObject
+from cnpgen.documents import JsonMapping, JsonObject
 from cnpgen.errors import UsageError, nearest
 from cnpgen.robots.parameter_ranges import PARAMETER_UNITS
 from cnpgen.store.files.accounted import MISSPELT

@@ -21,7 +21,8 @@ from cnpgen.addons.trajectories.table_units import plain
 from cnpgen.addons.trajectories.trajectory_scenes import problem_of_samples, with_scenes
 from cnpgen.addons.trajectories.trajectory_table import TrajectoryTable
 from cnpgen.addons.trajectories.trajectory_tables import read_trajectory_tables
-from cnpgen.arrays import AnyPath, Array, NamedNumbers, Names
+from cnpgen.arrays import Array
+from cnpgen.documents import AnyPath, NamedNumbers, Names
 from cnpgen.errors import UsageError, either, nearest
 from cnpgen.plans.stated_units import SCALE_ATTRIBUTES, UNIT_ATTRIBUTES
 from cnpgen.problems.problem import Problem

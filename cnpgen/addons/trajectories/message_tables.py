@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cnpgen.addons.trajectories.trajectory_table import TrajectoryTable
-from cnpgen.arrays import JsonMapping
+from cnpgen.documents import JsonMapping
 from cnpgen.errors import UsageError
 from cnpgen.store.files.accounted import (
     Account,

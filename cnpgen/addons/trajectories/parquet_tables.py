@@ -11,7 +11,7 @@ from cnpgen.addons.trajectories.array_tables import with_units
 from cnpgen.addons.trajectories.load_options import LoadOptions
 from cnpgen.addons.trajectories.text_tables import text_array
 from cnpgen.addons.trajectories.trajectory_table import TrajectoryTable, Values
-from cnpgen.arrays import JsonObject
+from cnpgen.documents import JsonObject
 from cnpgen.errors import UsageError, requires_extra
 from cnpgen.plans.format import JOINT_NAMES_KEY, PLAN_COLUMN
 from cnpgen.plans.stated_units import UNIT_ATTRIBUTES

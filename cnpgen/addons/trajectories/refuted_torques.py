@@ -19,7 +19,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from cnpgen.addons.trajectories.refuted_limits import RefutedLimit
-from cnpgen.arrays import Array, Indices, Names
+from cnpgen.arrays import Array, Indices
+from cnpgen.documents import Names
 from cnpgen.judges.plans.verdict import Margin
 
 Torques = Callable[[Array, Array, Array], Array]  # of states, shape (K, n) each

@@ -29,7 +29,8 @@ from cnpgen.addons.trajectories.trajectory_table import (
     MAX_RATE_DEVIATION,
     TrajectoryTable,
 )
-from cnpgen.arrays import Array, NamedNumbers
+from cnpgen.arrays import Array
+from cnpgen.documents import NamedNumbers
 from cnpgen.errors import UsageError, listed, nearest
 from cnpgen.plans.format import PHASE_COLUMN
 from cnpgen.problems.problem_record import ProblemRecord

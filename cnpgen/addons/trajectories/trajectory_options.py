@@ -7,11 +7,11 @@ from dataclasses import fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from cnpgen.arrays import Names, TextRows
 from cnpgen.cli import recipe_names, values
 from cnpgen.cli.parser import Options, options_of
 from cnpgen.cli.terminal import table
 from cnpgen.cli.verdict_text import margin_cells, margin_head
+from cnpgen.documents import Names, TextRows
 from cnpgen.errors import UsageError, counted, listed
 
 if TYPE_CHECKING:

@@ -6,7 +6,8 @@ from pathlib import Path
 import numpy as np
 
 from cnpgen.addons.trajectories.sampled_trajectory import Trajectory
-from cnpgen.arrays import AnyPath, Array
+from cnpgen.arrays import Array
+from cnpgen.documents import AnyPath
 from cnpgen.judges.plans.plan_plot import PLOT_SAMPLES, draw_path, plot_times
 from cnpgen.judges.plans.verdict import Margin
 from cnpgen.problems.obstacles import scene_of

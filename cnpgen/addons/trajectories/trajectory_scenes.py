@@ -14,7 +14,8 @@ from pathlib import Path
 import numpy as np
 
 from cnpgen.addons.trajectories.sampled_trajectory import Trajectory
-from cnpgen.arrays import AnyPath, Array
+from cnpgen.arrays import Array
+from cnpgen.documents import AnyPath
 from cnpgen.errors import UsageError, counted, listed
 from cnpgen.make.recipe import load_dataset_recipe
 from cnpgen.plans.format import PlanStatus

@@ -8,7 +8,7 @@ from typing import Any
 
 from numpy.typing import NDArray
 
-from cnpgen.arrays import NamedNumbers, Names
+from cnpgen.documents import NamedNumbers, Names
 
 Values = NDArray[Any]
 

@@ -23,7 +23,8 @@ from cnpgen.addons.trajectories.lower_bounds import LAGS, first_derivatives
 from cnpgen.addons.trajectories.refuted_limits import RefutedLimit
 from cnpgen.addons.trajectories.sample_errors import SampleErrors
 from cnpgen.addons.trajectories.sampled_trajectory import Trajectory
-from cnpgen.arrays import Array, Names
+from cnpgen.arrays import Array
+from cnpgen.documents import Names
 from cnpgen.errors import RecipeError
 from cnpgen.judges.plans.verdict import Margin
 from cnpgen.problems.constraints.constraint import Condition, Constraint

@@ -10,7 +10,8 @@ from xml.etree import ElementTree
 import numpy as np
 from numpy.typing import NDArray
 
-from cnpgen.arrays import Array, JsonObject
+from cnpgen.arrays import Array
+from cnpgen.documents import JsonObject
 from cnpgen.errors import RecipeError
 from cnpgen.problems.problem import Problem
 from cnpgen.robots.chain import frame_of

@@ -17,7 +17,8 @@ from cnpgen.addons.view.view_bodies import (
     tube,
     wrapped,
 )
-from cnpgen.arrays import Array, JsonObject, Names
+from cnpgen.arrays import Array
+from cnpgen.documents import JsonObject, Names
 from cnpgen.judges.plans.condition_curves import (
     ConditionCurve,
     condition_curves,

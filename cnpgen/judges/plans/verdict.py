@@ -8,7 +8,7 @@ from enum import StrEnum
 
 import numpy as np
 
-from cnpgen.arrays import JsonObject
+from cnpgen.documents import JsonObject
 from cnpgen.schema.html_table import html_table
 
 # Replaces a tolerance of 0 in relative violations, so that they can be compared.

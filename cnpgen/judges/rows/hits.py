@@ -22,7 +22,8 @@ from itertools import combinations
 
 import numpy as np
 
-from cnpgen.arrays import Array, JsonMapping
+from cnpgen.arrays import Array
+from cnpgen.documents import JsonMapping
 from cnpgen.judges.rows.row_report import Check, Index, compare
 from cnpgen.problems.constraints.constraint import BOUNDARY_TOLERANCES
 from cnpgen.robots.robot import Robot

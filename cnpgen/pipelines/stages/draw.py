@@ -6,7 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from cnpgen.arrays import Array, NamedErrors, Vector3
+from cnpgen.arrays import Array, Vector3
+from cnpgen.documents import NamedErrors
 from cnpgen.errors import RecipeError
 from cnpgen.kernels.symbolic.kinematics import tip_position
 from cnpgen.pipelines.stages.candidate_table import in_world, in_world_box

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from cnpgen.arrays import NamedErrors
+from cnpgen.documents import NamedErrors
 from cnpgen.errors import RecipeError
 from cnpgen.kernels.symbolic.kinematics import (
     Kinematics,

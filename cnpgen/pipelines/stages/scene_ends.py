@@ -7,7 +7,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from cnpgen.arrays import Array, Mask, NamedErrors
+from cnpgen.arrays import Array, Mask
+from cnpgen.documents import NamedErrors
 from cnpgen.errors import RecipeError
 from cnpgen.kernels.kernel import Kernel
 from cnpgen.kernels.symbolic.kinematics import forward_kinematics, tip_position

@@ -13,7 +13,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from cnpgen.arrays import Array, Mask, NamedErrors
+from cnpgen.arrays import Array, Mask
+from cnpgen.documents import NamedErrors
 from cnpgen.problems.constraints.constraint import (
     Condition,
     Conditions,

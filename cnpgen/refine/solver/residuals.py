@@ -6,7 +6,8 @@ from typing import Any
 
 import numpy as np
 
-from cnpgen.arrays import Array, JsonObject
+from cnpgen.arrays import Array
+from cnpgen.documents import JsonObject
 from cnpgen.kernels.symbolic.linalg import symbols
 from cnpgen.kernels.symbolic.symbolic_state import (
     FrozenState,

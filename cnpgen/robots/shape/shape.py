@@ -12,7 +12,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from cnpgen.arrays import Array, JsonObject, Vector3
+from cnpgen.arrays import Array, Vector3
+from cnpgen.documents import JsonObject
 from cnpgen.errors import RecipeError, nearest
 from cnpgen.robots.chain import Chain, frame_of
 from cnpgen.robots.robot_spec import HeldObject

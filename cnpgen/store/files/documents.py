@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from cnpgen.arrays import JsonMapping, JsonObject
+from cnpgen.documents import JsonMapping, JsonObject
 from cnpgen.errors import DatasetError
 from cnpgen.store.files.atomic import read_file, write_file
 from cnpgen.store.files.document_structure import Structure, check_structure

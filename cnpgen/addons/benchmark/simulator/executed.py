@@ -10,7 +10,8 @@ from cnpgen.addons.benchmark.simulator import hockey
 from cnpgen.addons.benchmark.simulator.reference import TICK_S, Reference
 from cnpgen.addons.benchmark.simulator.simulator_scene import SimulatorScene
 from cnpgen.addons.benchmark.simulator.tip import Tip
-from cnpgen.arrays import Array, JsonMapping, JsonObject, Mask
+from cnpgen.arrays import Array, Mask
+from cnpgen.documents import JsonMapping, JsonObject
 from cnpgen.judges.plans.metrics import tilt
 
 # Of the mallet's height, as in the Air Hockey Challenge (2023).

@@ -20,7 +20,8 @@ from cnpgen.addons.benchmark.simulator.reference import (
 )
 from cnpgen.addons.benchmark.simulator.simulator_scene import SimulatorScene
 from cnpgen.addons.benchmark.simulator.tip import Tip
-from cnpgen.arrays import Array, JsonObject
+from cnpgen.arrays import Array
+from cnpgen.documents import JsonObject
 from cnpgen.errors import UsageError, counted
 from cnpgen.machine.workers import distribute, worker_count
 from cnpgen.plans.plans import Plans
