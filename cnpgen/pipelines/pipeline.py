@@ -1,6 +1,6 @@
 """Pipelines: stages that sample the boundary conditions of a problem, their files, and the fields that they store."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -287,14 +287,30 @@ def written_columns(
                 )
             )
         written.update(step.stage.writes(context))
+    errors += _replaced_stages(steps, context)
+    drawn = ("parameters",) if context.problem.parameters else ()
     errors += [
         f"{path}: no stage writes {name}, which every sample must have"
-        for name in REQUIRED_COLUMNS
+        for name in (*REQUIRED_COLUMNS, *drawn)
         if name not in written
     ]
     if errors:
         raise RecipeError(errors)
     return written
+
+
+def _replaced_stages(steps: Sequence[PipelineStep], context: Context) -> Iterator[str]:
+    """Yield errors of stages all of whose columns are written again before a stage reads one of them."""
+    for place, step in enumerate(steps, start=1):
+        left = {*step.stage.writes(context)}
+        for later in steps[place:]:
+            if not left or not left.isdisjoint(later.stage.inputs):
+                break
+            left.difference_update(later.stage.writes(context))
+            if not left:
+                yield step.error(
+                    f"has no effect: stage {later.number} ({later.kind}) writes all of its columns again"
+                )
 
 
 def prepare_steps(

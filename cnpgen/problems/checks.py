@@ -130,6 +130,7 @@ def problem_errors(raw: ProblemTables) -> Iterator[str]:
     yield from _repeated(raw, "constraint", "use")
     yield from _repeated(raw, "obstacle", "name")
     uses = {str(each.get("use")) for _, each in tables(table, "constraint")}
+    yield from _idle_errors(raw, uses)
     # Built-in constraints that use obstacles; contacts of the held object count only if
     # there is one.
     using = (
@@ -161,6 +162,27 @@ def problem_errors(raw: ProblemTables) -> Iterator[str]:
         yield from _paper_errors(raw)
     elif raw.collision_elements is not None:
         yield from _shape_errors(raw, raw.collision_elements)
+
+
+def _idle_errors(raw: ProblemTables, uses: set[str]) -> Iterator[str]:
+    """Check that no key replaces another one, and that something may touch the held object."""
+    limits = raw.table.get("limits")
+    if isinstance(limits, dict) and "acceleration" in limits:
+        for key in ("acceleration_rate", "acceleration_cap"):
+            if key in limits:
+                yield (raw.where / "limits" / key).message(
+                    "'acceleration' takes its place: remove one of them"
+                )
+    # The obstacles may stand below the object, and plug-ins may use it.
+    if (
+        "object" in raw.table
+        and raw.collision_elements == []
+        and not raw.table.get("obstacle")
+        and uses <= BUILT_IN[CONSTRAINTS].keys()
+    ):
+        yield (raw.where / "object").message(
+            "nothing uses it: there are no obstacles, and the URDF has no <collision> elements"
+        )
 
 
 def _robot_errors(raw: ProblemTables) -> Iterator[str]:
@@ -252,10 +274,13 @@ def _paper_errors(raw: ProblemTables) -> Iterator[str]:
     for place, _ in raw.constraints("self-clearance"):
         text = 'self-clearance needs geometry = "urdf" in [robot], and <collision> elements'
         yield (where / "constraint" / place).message(text)
-    if robot.get("convex_parts", 1) != 1:
-        yield (where / "robot" / "convex_parts").message(
-            'meshes matter with geometry = "urdf" only'
-        )
+    # The links that a held object may not touch have the shape of the URDF anyway.
+    shapes = [] if "object" in raw.table else ["visual_links", "skipped_meshes"]
+    for key in ("convex_parts", *shapes):
+        if robot.get(key) not in (None, [], 1):
+            yield (where / "robot" / key).message(
+                'meshes matter with geometry = "urdf" only'
+            )
     payload = raw.table.get("payload")
     if isinstance(payload, dict) and payload.get("touch_links"):
         text = 'a payload is a body with geometry = "urdf" in [robot] only'

@@ -109,6 +109,12 @@ class DriveSpec:
                 "armature",
                 "is also given by 'rotor_inertia' and 'gear_ratio', expected one of them",
             )
+        has_friction = self.viscous or self.coulomb or self.urdf_dynamics == "use"
+        if self.friction_help and not has_friction:
+            yield (
+                "friction_help",
+                "there is no friction: give 'viscous' or 'coulomb', or urdf_dynamics = \"use\"",
+            )
         for key in ("power", "line"):
             if self.limits == "joint" and getattr(self, key):
                 yield key, "limits motors, but 'limits' is \"joint\""

@@ -76,6 +76,11 @@ def check_elements(
     """
     if tree.tag != "robot":
         raise RecipeError([f"{path}: its root is <{tree.tag}>, expected <robot>"])
+    for tag in _TOP:
+        for number, part in enumerate(tree.findall(tag), start=1):
+            if not part.get("name"):
+                text = f"<{tag}> {number} of the file has no name, expected a text"
+                raise RecipeError([f"{path}: {text}"])
     hints = {
         text: nearest(name, names, similarity=MISSPELT) or _other_place(name, known)
         for text, name, names in _unknown(tree, known)

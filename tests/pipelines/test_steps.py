@@ -8,6 +8,7 @@ import pytest
 from cnpgen import plugins
 from cnpgen.errors import RecipeError
 from cnpgen.pipelines.pipeline import load_pipeline
+from cnpgen.pipelines.stages.draw import DrawParameters
 from cnpgen.store.field import Field
 from tests.conftest import Prepare
 
@@ -86,3 +87,28 @@ def test_a_stage_may_change_limits_and_description_of_a_field(
     prepared = prepare(with_stage(kind, monkeypatch))
     (field,) = (field for field in prepared.fields if field.name == "start_q")
     assert (field.valid_max, field.long_name) == ((1.0,) * 6, "again")
+
+
+@pytest.mark.parametrize("kind", ["DrawPositions", "StartIK", "AtRest"])
+def test_a_stage_whose_columns_are_replaced_is_refused(
+    prepare: Prepare, kind: str
+) -> None:
+    pipeline = load_pipeline("airhockey-hit")
+    twice = [
+        copy
+        for stage in pipeline.stage
+        for copy in [stage] * (2 if type(stage).__name__ == kind else 1)
+    ]
+    with pytest.raises(RecipeError) as caught:
+        prepare(replace(pipeline, stage=tuple(twice)))
+    (error,) = caught.value.errors
+    text = r"stage (\d) \((.*)\): has no effect: stage \d \(\2\) writes all of its columns again"
+    assert re.search(text, error)
+
+
+def test_a_pipeline_draws_the_parameters_of_its_problem(prepare: Prepare) -> None:
+    pipeline = load_pipeline("airhockey-tables")
+    kept = [each for each in pipeline.stage if not isinstance(each, DrawParameters)]
+    assert len(kept) == len(pipeline.stage) - 1
+    with pytest.raises(RecipeError, match="no stage writes parameters"):
+        prepare(replace(pipeline, stage=tuple(kept)))

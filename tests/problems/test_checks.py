@@ -1,5 +1,6 @@
 """Errors in robots are reported with the element that has them."""
 
+import shutil
 from pathlib import Path
 from xml.etree import ElementTree
 
@@ -77,6 +78,41 @@ def test_a_tip_that_is_not_there_is_refused_with_all_frames(tmp_path):
         "robot.tip: crane.urdf has no frame 'hnad' (did you mean 'hand'?); its frames: base, turret, arm"
         in found
     )
+
+
+@pytest.mark.parametrize("tag", ["link", "joint"])
+@pytest.mark.parametrize("name", [None, ""])
+def test_links_and_joints_have_names(tmp_path: Path, tag: str, name: str | None):
+    tree = ElementTree.fromstring(urdf())
+    part = tree.findall(tag)[-1]
+    del part.attrib["name"]
+    if name is not None:
+        part.set("name", name)
+    file = write_problem(tmp_path)
+    (tmp_path / "crane" / "crane.urdf").write_text(ElementTree.tostring(tree).decode())
+    number = len(tree.findall(tag))
+    assert f"crane.urdf: <{tag}> {number} of the file has no name" in errors(file)
+
+
+@pytest.mark.parametrize("key", ["acceleration_rate", "acceleration_cap"])
+def test_rules_beside_stated_accelerations_are_refused(tmp_path: Path, key: str):
+    found = errors(limited(tmp_path, f"acceleration = 5\n{key} = 10"))
+    assert f"limits.{key}: 'acceleration' takes its place: remove one of them" in found
+
+
+@pytest.mark.parametrize("key", ["visual_links", "skipped_meshes"])
+def test_links_without_shapes_have_no_meshes(tmp_path: Path, key: str):
+    robot = f'geometry = "paper-capsules"\n{key} = ["claw"]'
+    file = write_problem(tmp_path, robot=robot, obstacles="", more="")
+    assert f'robot.{key}: meshes matter with geometry = "urdf" only' in errors(file)
+
+
+def test_a_held_object_that_nothing_can_touch_is_refused(tmp_path: Path):
+    shutil.copytree(load_problem("airhockey").path.parent, tmp_path / "hits")
+    file = tmp_path / "hits" / "problem.toml"
+    with file.open("a", encoding="utf-8") as stream:
+        stream.write("\n[object]\nsize = [0.1, 0.1, 0.1]\n")
+    assert "object: nothing uses it: there are no obstacles, and" in errors(file)
 
 
 def limited(folder: Path, limit: str) -> Path:

@@ -396,6 +396,7 @@ def test_stated_friction_replaces_that_of_the_urdf(tmp_path: Path) -> None:
         ('viscous = "1 N m"', "expected a viscous friction"),
         ("reversal_speed = 0.001", "reversal_speed"),
         ("friction_help = 2", "friction_help"),
+        ("friction_help = 0.5", "drive.friction_help: there is no friction"),
         ('limits = "motors"', "limits"),
         ("coulomb = 20", "j4: friction of 20 N m at rest leaves nothing of the motor"),
         ("power = 0", "power"),

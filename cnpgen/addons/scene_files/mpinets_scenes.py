@@ -108,6 +108,17 @@ def _check_names(file: Hdf5, account: Account) -> None:
     for name in (*used, SCENE_NAMES):
         entries.get(name)
     account.finish(entries)
+    _check_counts(file, [name for name in used if name in file.names()])
+
+
+def _check_counts(file: Hdf5, names: Sequence[str]) -> None:
+    """Check that datasets have equally many rows: those of a part of a file would match by chance."""
+    for name in names:
+        shape, scenes = file[name].shape, file[names[0]].shape[:1]
+        if shape[:1] != scenes:
+            raise SceneError(
+                f"{file.path}: {name} must have shape {(*scenes, '...')}, one row per scene of {names[0]}, got {shape}"
+            )
 
 
 def _quaternions(file: Hdf5, word: str) -> str:
@@ -153,7 +164,9 @@ def _check_rows(file: Hdf5, name: str, rows: slice) -> None:
 def _entries(file: Hdf5, kind: str, rows: slice, count: int) -> Array:
     """Return sizes, centers and quaternions of the obstacles of a kind, shape (N, M, sizes + 7)."""
     names, widths, word = _SHAPES[kind]
-    if not any(name in file for name in names):
+    # A part of the datasets of a kind is an error: it is not a file without the kind.
+    parts = (*names, f"{word}_centers", _quaternions(file, word))
+    if not any(name in file for name in parts):
         return np.zeros((count, 0, sum(widths) + 7))
     columns = [
         _column(file, name, width, rows, count)

@@ -32,6 +32,7 @@ UNUSED_ELEMENTS = UnusedElements(
     harmless={"collision_buffer_ik": "distance at which the goal states were drawn"}
 )
 _KINDS = ("cuboid", "cylinder", "sphere")
+_SIGNS = {"obstacles", "goal_ik", "goal_pose"}  # keys, one of which every problem has
 
 
 def is_robometrics(document: Any) -> bool:
@@ -43,7 +44,7 @@ def is_robometrics(document: Any) -> bool:
         isinstance(first, list)
         and bool(first)
         and isinstance(first[0], dict)
-        and "obstacles" in first[0]
+        and not _SIGNS.isdisjoint(first[0])
     )
 
 
@@ -63,6 +64,10 @@ def read_robometrics(
             counted = accounted(entry, account)
             problem = _problem(path, name, counted, place)
             account.finish(counted)
+            if entry.get("obstacles") is None:
+                raise SceneError(
+                    f"{place} has no obstacles, expected a mapping, which may be empty"
+                )
             request = replace(problem.request, accepted=tuple(account.accepted))
             yield replace(problem, request=request), account
 
@@ -106,9 +111,12 @@ def _goal_pose(entry: Any, place: str) -> GoalPose | None:
     if text := quaternion_error(quaternion):
         raise SceneError(f"{place}: goal_pose: {text}")
     position = vector(entry.get("position_xyz"), "xyz", f"{place}: goal_pose")
-    return GoalPose(
-        part(entry, "frame", str, place), position, rotation_matrix(quaternion)
-    )
+    frame = part(entry, "frame", str, place)
+    if not frame:
+        raise SceneError(
+            f"{place}: goal_pose has no frame, expected a link of the robot"
+        )
+    return GoalPose(frame, position, rotation_matrix(quaternion))
 
 
 def _obstacles(obstacles: Any, place: str) -> Iterator[Obstacle]:

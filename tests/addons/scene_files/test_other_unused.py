@@ -106,6 +106,34 @@ def test_every_element_of_robometrics_files_is_used_refused_or_listed(
         assert load(tmp_path, wrong, allow_unused=[key]).request.accepted
 
 
+@pytest.mark.parametrize("key", ["obstacles", "obstacle"])
+@pytest.mark.parametrize("count", [1, 2])
+def test_every_problem_of_robometrics_states_its_obstacles(
+    tmp_path: Path, key: str, count: int
+) -> None:
+    without = {name: PROBLEM[name] for name in PROBLEM if name != "obstacles"}
+    problems = [*[PROBLEM] * (count - 1), without]
+    if key == "obstacle":
+        without[key] = PROBLEM["obstacles"]
+    (tmp_path / "set.yaml").write_text(json.dumps({"shelf": problems}))
+    text = "has no obstacles" if key == "obstacles" else "did you mean 'obstacles'"
+    with pytest.raises(SceneError, match=rf"'shelf {count - 1}' .*{text}"):
+        load_scenes(tmp_path / "set.yaml")
+    without |= {key: {}, "obstacles": {}}
+    without.pop("obstacle", None)
+    assert load(tmp_path, without).obstacles == ()
+
+
+@pytest.mark.parametrize("goals", [PROBLEM["goal_ik"], []])
+def test_a_goal_pose_of_robometrics_names_its_frame(
+    tmp_path: Path, goals: list[list[float]]
+) -> None:
+    pose = {key: PROBLEM["goal_pose"][key] for key in PROBLEM["goal_pose"]}
+    del pose["frame"]
+    with pytest.raises(SceneError, match="'shelf 0': goal_pose has no frame"):
+        load(tmp_path, PROBLEM | {"goal_ik": goals, "goal_pose": pose})
+
+
 @needs_robots
 def test_the_world_frame_of_robometrics_is_a_link_of_the_robot(tmp_path: Path) -> None:
     robot = load_robot(load_problem("panda"))
@@ -181,6 +209,40 @@ def test_unknown_datasets_of_hdf5_files_are_refused(
         )
         assert [digest(scene) for scene in load_scenes(file)] == usual
     assert "not used: global_solutions" in caplog.text
+
+
+CYLINDERS = {
+    "cylinder_radii": np.full((2, 1, 1), 0.1),
+    "cylinder_heights": np.full((2, 1, 1), 0.2),
+    "cylinder_centers": np.full((2, 1, 3), 0.5),
+    "cylinder_quaternions": np.tile([1.0, 0, 0, 0], (2, 1, 1)),
+}
+
+
+@pytest.mark.parametrize(
+    "lost", ["cuboid_dims", "cuboid_centers", "cuboid_quaternions", *CYLINDERS]
+)
+def test_a_part_of_the_datasets_of_a_kind_is_refused(tmp_path: Path, lost: str) -> None:
+    file = hdf5(tmp_path, **CYLINDERS)
+    assert len(load_scenes(file)[0].obstacles) == 2
+    with h5py.File(file, "a") as content:
+        del content[lost]
+    with pytest.raises(SceneError, match=rf"scenes\.h5 lacks {lost}$"):
+        load_scenes(file)
+
+
+def test_centers_without_radii_are_refused(tmp_path: Path) -> None:
+    with pytest.raises(SceneError, match="lacks sphere_radii"):
+        load_scenes(hdf5(tmp_path, sphere_centers=np.full((2, 1, 3), 0.5)))
+
+
+@pytest.mark.parametrize("name", ["cuboid_dims", "goal_q"])
+def test_a_part_of_a_file_has_equal_numbers_of_rows_too(
+    tmp_path: Path, name: str
+) -> None:
+    rows = np.full((3, 1, 3), 0.1) if name == "cuboid_dims" else np.ones((3, 7))
+    with pytest.raises(SceneError, match=rf"{name} must have shape \(2, .*got \(3, "):
+        load_scenes(hdf5(tmp_path, **{name: rows}), n=2)
 
 
 @pytest.mark.parametrize("name", ["cuboid_dims", "cuboid_quaternions", "start_q"])
