@@ -47,7 +47,7 @@ from cnpgen.robots.urdf_changes import (
     with_payload_link,
     with_point_masses,
 )
-from cnpgen.robots.urdf_elements import check_elements
+from cnpgen.robots.urdf_elements import check_elements, check_names
 from cnpgen.schema import registry
 from cnpgen.schema.argument_types import checked_arguments
 from cnpgen.schema.keys import NAME, Range, field, to_dict
@@ -431,6 +431,7 @@ class Problem:
             with suppress(ValueError):
                 tree = urdf_tree(text)
                 check_elements(tree, self.urdf_path, allow_unused=spec.allow_unused)
+                check_names(tree, self.urdf_path)
         text = with_locked_joints(text, positions, is_stored=self.is_stored)
         text = with_point_masses(text)
         # Meshes need not exist where no constraint uses the geometry.

@@ -76,11 +76,6 @@ def check_elements(
     """
     if tree.tag != "robot":
         raise RecipeError([f"{path}: its root is <{tree.tag}>, expected <robot>"])
-    for tag in _TOP:
-        for number, part in enumerate(tree.findall(tag), start=1):
-            if not part.get("name"):
-                text = f"<{tag}> {number} of the file has no name, expected a text"
-                raise RecipeError([f"{path}: {text}"])
     hints = {
         text: nearest(name, names, similarity=MISSPELT) or _other_place(name, known)
         for text, name, names in _unknown(tree, known)
@@ -93,6 +88,15 @@ def check_elements(
         named = listed(parts, MAX_LISTED_TAGS)
         remedy = "rename or remove it, or accept its loss by allow_unused in [robot] (--allow-unused of 'cnpgen init')"
         raise RecipeError([f"{path}: {named} would not be read: {remedy}"])
+
+
+def check_names(tree: Element, path: Path) -> None:
+    """Raise RecipeError if a link or a joint has no name."""
+    for tag in _TOP:
+        for number, part in enumerate(tree.findall(tag), start=1):
+            if not part.get("name"):
+                text = f"<{tag}> {number} of the file has no name, expected a text"
+                raise RecipeError([f"{path}: {text}"])
 
 
 def unknown_names(

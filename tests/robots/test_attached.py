@@ -35,6 +35,9 @@ def written(
 ) -> Problem:
     """The shipped problem with other keys, and its URDF changed."""
     text = (HEAVY / "problem.toml").read_text()
+    if "acceleration" in limits:
+        # Stated accelerations take the place of the rules.
+        text = re.sub(r"\nacceleration_(rate|cap) = .*", "", text)
     text = text.replace("\n[limits]\n", f"{robot}\n{more}\n[limits]\n{limits}")
     (folder / "problem.toml").write_text(text)
     (folder / "iiwa14_object.urdf").write_text(
