@@ -22,6 +22,7 @@ from cnpgen.problems.problem_file import load_problem
 # Modules that builders import and whose changes do not affect tapes.
 WITHOUT_EFFECT = {
     "cnpgen.arrays": "types of arrays",
+    "cnpgen.documents": "types of tables, names and paths",
     "cnpgen.errors": "the words of exceptions",
     "cnpgen.schema": "how recipes are read: what was read is in the problem's identity",
     "cnpgen.machine.versions": "the processor, which is in no tape",
