@@ -134,7 +134,7 @@ def write(tapes: dict[str, Tape], folder: Path) -> None:
     folder.mkdir(exist_ok=True)
     names = {key: digest_of(tape) for key, tape in contents.items()}
     (folder / shipped_tapes.INDEX).write_text(json.dumps(names, indent=0) + "\n", encoding="ascii")  # fmt: skip
-    unique = {digest_of(tape): tape.to_bytes() for tape in contents.values()}
+    unique = {names[key]: tape.to_bytes() for key, tape in contents.items()}
     with zipfile.ZipFile(folder / shipped_tapes.ARCHIVE, "w", zipfile.ZIP_LZMA) as archive:  # fmt: skip
         for name in sorted(unique):
             archive.writestr(zipfile.ZipInfo(name), unique[name], zipfile.ZIP_LZMA)
