@@ -79,11 +79,7 @@ def export(
     sources: Sequence[Path] = (),
 ) -> int:
     """Export plans, which also depend on files beside those that the options name."""
-    from cnpgen.cli.finished import (
-        content_sha256,
-        is_finished,
-        record_request,
-    )
+    from cnpgen.cli.finished import content_sha256, is_finished, record_request
     from cnpgen.plans.export import export_plans, load_exporter
     from cnpgen.problems.problem_record import open_problem
 

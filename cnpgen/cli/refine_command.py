@@ -180,10 +180,9 @@ def refine_and_save(
     # The journal keeps finished plans until the output is complete.
     journal = out.with_name(out.name + ".part")
     # ``discard`` applies to the journal of another request.
-    settings = {"options": options, "journal": journal, "discard": arguments.force}
-    settings |= options_of(arguments, *ENGINE)
+    settings = {"options": options, **options_of(arguments, *ENGINE)}
     chosen: Callable[..., Refinement | SolvedScenes] = make or refine_plans
-    run = partial(chosen, plans, **settings)
+    run = partial(chosen, plans, journal=journal, discard=arguments.force, **settings)
     with resumable(journal), Meter(quiet=arguments.quiet, noun="plan") as meter:
         found = _run_with_meter(run, meter, title)
         facts = found.summary()

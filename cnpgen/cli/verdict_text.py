@@ -55,16 +55,10 @@ def summary_text(file: Path, found: "Evaluation") -> str:
         (text, f"{number:,} of {count:,}", f"{share:.2%}", "")
         for text, (number, share) in counts.items()
     ]
-    sections = [
-        [
-            head,
-            checksum_text(found.plans),
-            *([f"torque: {found.judged_torque}"] if found.judged_torque else []),
-            *filter(None, [sources_line(found.limit_sources)]),
-            "",
-            *table(tallies, indent="  ", right=(1, 2)),
-        ]
-    ]
+    torque = f"torque: {found.judged_torque}" if found.judged_torque else ""
+    notes = filter(None, [torque, sources_line(found.limit_sources)])
+    rows = table(tallies, indent="  ", right=(1, 2))
+    sections = [[head, checksum_text(found.plans), *notes, "", *rows]]
     tables = (
         (_reasons(found, summary), (1,)),
         (_figures(summary, _shown(found)), range(1, 7)),

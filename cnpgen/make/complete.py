@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -112,39 +112,57 @@ def complete(
         RecipeError: The recipe has errors.
         MachineError: No backend works, or the table cannot be read.
     """
+    completer = _completer_of(recipe, extrapolate=extrapolate)
+    if table is None:
+        return completer.run(columns)
+    if columns:
+        raise UsageError(
+            f"give a table or columns, got the table {table} and {', '.join(columns)}",
+            argument="table",
+        )
+    tasks = read_tasks(Path(table), completer.fields, flat=completer.flat)
+    try:
+        return completer.run(tasks)
+    except UnitError as error:
+        raise UnitError(f"{table}: {error}", concerns="table") from error
+    except UsageError as error:
+        raise DatasetError(f"{table}: {error}") from error
+
+
+@dataclass(frozen=True)
+class _Completer:
+    """Completion of the tasks of a recipe.
+
+    Attributes:
+        run: Columns -> completed tasks.
+        fields: Fields that a table of tasks may have.
+        flat: Whether positions lie on a table, so that they need no z.
+    """
+
+    run: Callable[[Mapping[str, ArrayLike]], Completed]
+    fields: Mapping[str, Field]
+    flat: bool
+
+
+def _completer_of(
+    recipe: str | Path | Pipeline | DatasetRecipe | Problem, *, extrapolate: bool
+) -> _Completer:
     problem = problem_of_poses(recipe)
     if problem is not None:
         if extrapolate:
             text = "has no effect on tasks with goal poses, which have no parameters"
             raise UsageError(text, argument="extrapolate")
         poses = PoseTasks(problem)
-        fields = poses.fields
-        flat = False
-        run = partial(_completed_poses, poses)
-    else:
-        pipeline = (
-            recipe
-            if isinstance(recipe, Pipeline)
-            else as_dataset_recipe(recipe).pipeline
-        )
-        context = load_context(pipeline.problem, *choose_backend(None))
-        fields = given_fields(steps_of(pipeline), context)
-        flat = table_height(context) is not None
-        run = partial(_completed, pipeline, context, extrapolate)
-    if table is None:
-        return run(columns)
-    if columns:
-        raise UsageError(
-            f"give a table or columns, got the table {table} and {', '.join(columns)}",
-            argument="table",
-        )
-    tasks = read_tasks(Path(table), fields, flat=flat)
-    try:
-        return run(tasks)
-    except UnitError as error:
-        raise UnitError(f"{table}: {error}", concerns="table") from error
-    except UsageError as error:
-        raise DatasetError(f"{table}: {error}") from error
+        return _Completer(partial(_completed_poses, poses), poses.fields, flat=False)
+    pipeline = (
+        recipe if isinstance(recipe, Pipeline) else as_dataset_recipe(recipe).pipeline
+    )
+    context = load_context(pipeline.problem, *choose_backend(None))
+    return _Completer(
+        partial(_completed, pipeline, context, extrapolate),
+        given_fields(steps_of(pipeline), context),
+        flat=table_height(context) is not None,
+    )
 
 
 def _completed(

@@ -204,12 +204,12 @@ def solve_scenes(
     goals = _goals_of_all(loaded, robot, scenes, options)
     if chosen.begin is not None:
         chosen.begin(len(scenes), 0)
+    # Scenes of one capacity share kernels; each group has its own journal.
     groups = _groups(scenes)
     journals = _journals(journal, len(groups))
     refine = _refiner(chosen, progress, options, workers=workers, discard=discard)
     found = dict[int, tuple[Plans, Attempt]]()
     times = NO_TIME
-    # Scenes of one capacity share kernels; each group has its own journal.
     for (own, indices), file in zip(groups, journals, strict=True):
         of_group = {index: goals[index] for index in indices}
         plans = _adjusted(_plans_of(loaded, scenes, of_group, own), chosen)

@@ -126,9 +126,8 @@ def projected_path(
     # Clipping interior points suffices: the path lies in the hull of its control
     # points.
     elif within_limits:
-        change = [
-            clipped_to_limits(robot, point, [0.0] * n) for point in points[interior]
-        ]
+        zero = [0.0] * n
+        change = [clipped_to_limits(robot, point, zero) for point in points[interior]]
         points[interior] = _sums(points[interior], change)
     return ca.Function(
         "projected_path",

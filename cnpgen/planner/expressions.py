@@ -125,6 +125,20 @@ def speed_violation(robot: Robot, problem: Problem) -> Any:
     return ca.Function("speed_violation", [ca.vertcat(*columns)], [worst])
 
 
+def _largest_fraction(fast: Any, bounds: "SpeedBounds") -> list[Any]:
+    """Return the square of the largest fraction of the bounds of proportional residuals; none without them.
+
+    (dq / bound)^2 <= 1 for both signs of the bound: one row replaces all of them.
+    """
+    import casadi as ca
+
+    fractions = []
+    for bound in (bounds.lower, bounds.upper):
+        rows = np.flatnonzero(bounds.proportional & np.isfinite(bound)).tolist()
+        fractions += [fast[row] * float(1 / bound[row]) for row in rows]
+    return [reduce(ca.fmax, fractions, ca.SX(0)) ** 2] if fractions else []
+
+
 def speed_coefficients(robot: Robot, problem: Problem) -> Any:
     """Build ``(the column of speed_violation) -> constant, square, mixed``: coefficients of the rate's bounds.
 
@@ -141,7 +155,6 @@ def speed_coefficients(robot: Robot, problem: Problem) -> Any:
     values = speed_residuals(robot, problem)
     p, p1, p2, rates, obstacle_poses = columns
     zero = ca.SX.zeros(robot.n)
-    drive = robot.drive
     friction = [p1 * rates[0]] if has_friction(robot) else []
     # Three evaluations determine the coefficients: at rest (constant), at p' and p''
     # with r = 1 (square), and with ddq = p' alone (mixed).
@@ -150,18 +163,15 @@ def speed_coefficients(robot: Robot, problem: Problem) -> Any:
         for moving in ((zero, zero), (p1, p2), (zero, p1))
     )
     square, linear = fast - at_rest, []
+    drive = robot.drive
     if drive is not None and (drive.viscous.any() or drive.lines):
         parts = map(ca.vertsplit, (p1, p1 * rates[0]))
         linear = [_linear_rows(robot, problem, *parts)]
         # The evaluation at r = 1 contains the linear part, too.
         square = square - linear[0]
     bounds = speed_bounds(robot, problem)
-    others, fractions = np.flatnonzero(~bounds.proportional).tolist(), []
-    # (dq / bound)^2 <= 1 for both signs of the bound: one row replaces all of them.
-    for bound in (bounds.lower, bounds.upper):
-        rows = np.flatnonzero(bounds.proportional & np.isfinite(bound)).tolist()
-        fractions += [fast[row] * float(1 / bound[row]) for row in rows]
-    largest = [reduce(ca.fmax, fractions, ca.SX(0)) ** 2] if fractions else []
+    others = np.flatnonzero(~bounds.proportional).tolist()
+    largest = _largest_fraction(fast, bounds)
     none = [ca.SX.zeros(len(largest))]
     coefficients = [
         (at_rest, none),

@@ -398,14 +398,13 @@ def make_inference_pipeline(
     ``scale_time`` is for motions from rest to rest only.
     """
     problem, robot, kernels = loaded.problem.for_planning, loaded.robot, loaded.kernels
-    placed = loaded.problem.sample_obstacles
     prepare = make_task_preprocessor(
         problem,
         robot,
         kernels,
         config,
         fixed_at_goal=fixed_at_goal,
-        placed=placed,
+        placed=loaded.problem.sample_obstacles,
         observed=observed,
     )
     path = kernels.load(
@@ -421,11 +420,9 @@ def make_inference_pipeline(
         if config.time_parametrized
         else None
     )
-    via_points = (
-        make_via_points(problem, kernels, np.array(config.via_points))
-        if config.via_points
-        else None
-    )
+    via_points = None
+    if config.via_points:
+        via_points = make_via_points(problem, kernels, np.array(config.via_points))
     return InferencePipeline(
         prepare, path, time_scaling, time_parametrization, via_points
     )

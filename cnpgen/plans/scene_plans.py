@@ -98,9 +98,8 @@ def scene_plans(
         goals = [goal_states(scene, robot)[0] for scene in scenes]
     goal_q = numbers("goals", goals)
     if goal_q.shape != start.shape:
-        raise UsageError(
-            f"must have shape {start.shape}, got {goal_q.shape}", argument="goals"
-        )
+        text = f"must have shape {start.shape}, got {goal_q.shape}"
+        raise UsageError(text, argument="goals")
     zero, spec, count = np.zeros_like(start), problem.trajectory, len(scenes)
     fixed = len(problem.obstacle)
     ids = None if sample_id is None else numbers("sample_id", sample_id, "int64")

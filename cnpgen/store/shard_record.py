@@ -114,14 +114,15 @@ def record_from_json(content: JsonMapping) -> ShardRecord:
         raise DatasetError(f"the shard's record is damaged: {error}") from error
 
 
-def save_record(folder: Path, task: ShardTask, record: ShardRecord) -> None:
-    """Write a shard's sidecar; from now on the shard counts as made."""
+def save_record(folder: Path, task: ShardTask, record: ShardRecord) -> ShardRecord:
+    """Write a shard's sidecar, and return the record; from now on the shard counts as made."""
     document = {
         "format": SHARD_RECORD_FORMAT,
         "format_version": SHARD_RECORD_VERSION,
         **record_to_json(record),
     }
     save_document(folder / task.sidecar, document, work=folder / WORK)
+    return record
 
 
 def load_record(folder: Path, task: ShardTask) -> ShardRecord:
@@ -183,8 +184,7 @@ def commit_shard(
         )
         # Another process may already have summarized its record.
         if not is_committed(folder, spec, task):
-            save_record(folder, task, record)
-            return record
+            return save_record(folder, task, record)
     except CnpgenError:
         # Another process may have finished the dataset and removed temporary files.
         if not is_committed(folder, spec, task):

@@ -212,9 +212,7 @@ def boundary_of(  # noqa: PLR0917 - in the order of the paper
         if values is not None
     }
     if parameters is not None:
-        values = numbers("parameters", parameters)
-        width = values.shape[-1] if values.ndim else 0
-        arrays["parameters"] = _rows("parameters", values, width)
+        arrays["parameters"] = _parameter_rows(parameters)
     # Conditions of one row are repeated for all motions.
     rows = max(len(values) for values in arrays.values())
     for name, values in arrays.items():
@@ -264,6 +262,12 @@ def _rows(name: str, values: ArrayLike, n: int) -> Array:
         row = int(np.argmin(np.isfinite(rows).all(axis=1)))
         raise UsageError(f"must be finite, got {rows[row]} in row {row}", argument=name)
     return rows
+
+
+def _parameter_rows(parameters: ArrayLike) -> Array:
+    values = numbers("parameters", parameters)
+    width = values.shape[-1] if values.ndim else 0
+    return _rows("parameters", values, width)
 
 
 def _repeated(rows: Array, count: int) -> Array:

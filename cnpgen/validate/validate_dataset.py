@@ -282,8 +282,7 @@ def validate_dataset(
     existing = [task for task in shards(spec) if is_committed(folder, spec, task)]
     undamaged = _undamaged(existing, findings)
     findings += check_recipe(spec)
-    checked = DeepCheck()
-    again = Regeneration()
+    checked, again = DeepCheck(), Regeneration()
     if deep:
         findings += check_statistics(folder, spec)
         checked = check_rows(folder, spec, undamaged, where, progress)

@@ -175,16 +175,14 @@ def run_benchmark(
     problems, prefix = loaded.problems(n)
     if chosen.environment is not None:
         check_challenge(*open_problem(problems.problem))
-    seed = chosen.seed
-    setting = Setting(problems.problem, loaded.model, chosen.time_limit, seed)
+    setting = Setting(problems.problem, loaded.model, chosen.time_limit, chosen.seed)
     place = ResultsFolder(Path(folder), loaded, setting)
     names = {*place.planners(delete_others=force), *planners}
     _check_reference(chosen.reference, names)
-    runs = add_run(place.path, seed, planners)
+    runs = add_run(place.path, chosen.seed, planners)
     with assembled(where, len(problems)) as pool:
-        run = _BenchmarkRun(
-            place, robots, problems, prefix, pool, chosen, force, progress
-        )
+        tools = pool, chosen, force, progress
+        run = _BenchmarkRun(place, robots, problems, prefix, *tools)
         for name in planners:
             run.compare(name, replace(setting, parameters=given[name]), values[name])
     return run.collected(loaded, planners, runs)

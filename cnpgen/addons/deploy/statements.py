@@ -34,11 +34,10 @@ def statements(
     """
     lines: list[str] = []
     names: dict[int, str] = {}
-    angles: set[int] = set()
-    never_nan: set[int] = set()
+    angles, never_nan = set[int](), set[int]()
     arrays = tape.operation, tape.a, tape.b, tape.constant
-    columns = (array.tolist() for array in arrays)
-    for k, (code, a, b, constant) in enumerate(zip(*columns, strict=True)):
+    rows = zip(*(array.tolist() for array in arrays), strict=True)
+    for k, (code, a, b, constant) in enumerate(rows):
         name = NAMES[code]
         if name == "CONST":
             names[k] = f"K({_literal(constant)})"

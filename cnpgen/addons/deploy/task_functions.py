@@ -54,14 +54,8 @@ def task(
     start = forward_kinematics(robot.chain, conditions["start_q"])
     goal = forward_kinematics(robot.chain, conditions["goal_q"])
     velocity = tip_velocity(goal, conditions["goal_dq"])
-    poses = _scene(
-        robot,
-        problem,
-        start.tip,
-        goal.tip,
-        velocity=velocity,
-        parameters=parameters,
-    )
+    given = {"velocity": velocity, "parameters": parameters}
+    poses = _scene(robot, problem, start.tip, goal.tip, **given)
     time = _expected_time(
         robot, problem, ends_sx, conditions, parameters, kind=expected_time
     )

@@ -127,14 +127,8 @@ def write_repository(
     created = load_manifest(source)["created"]
     url = f"{HUB}/datasets/{repository}"
     plot_dataset(inspect_dataset(source), target / PICTURE)
-    card = card_text(
-        summary,
-        created=created,
-        folder=repository,
-        notes=notes,
-        shards=f"{HDF5}/",
-        picture=PICTURE,
-    )
+    places = {"folder": repository, "shards": f"{HDF5}/", "picture": PICTURE}
+    card = card_text(summary, created=created, notes=notes, **places)
     write_file(target / CARD, card)
     files: dict[str, list[SplitFile]] = {}
     for task, path, name in zip(tasks, tables, written, strict=False):

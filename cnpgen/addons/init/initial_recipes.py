@@ -97,10 +97,8 @@ def problem_of(
         overlaps = resolve_overlaps(problem) if arm.has_shape else None
         problem = overlaps.problem if overlaps else problem
         robot = load_robot(problem)
-    notes = [
-        *dict.fromkeys(str(each.message) for each in caught),
-        *(overlaps.notes if overlaps else ()),
-    ]
+    notes = list(dict.fromkeys(str(each.message) for each in caught))
+    notes += overlaps.notes if overlaps else ()
     arm, scale, overloaded = _with_torque_limits(arm, robot)
     limits = replace(
         problem.limits, torque_scale=scale, **_replaced_limits(arm, joint_limits, robot)

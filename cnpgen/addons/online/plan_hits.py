@@ -184,10 +184,8 @@ def plan_hits(
         """Plan hits at shares of the highest speed."""
         if not is_moving:
             task = completion, state, puck, target
-            plans, reasons = _plan_resting(
-                planner, task, speed_share, distance, parameters
-            )
-            return PlannedHits(plans, reasons, np.zeros(len(plans)), overlap)
+            found = _plan_resting(planner, task, speed_share, distance, parameters)
+            return PlannedHits(*found, np.zeros(len(found[0])), overlap)
         moving = MovingHits(
             planner.robot.n,
             (state, puck, puck_velocity, target, speed_share, meeting_time),

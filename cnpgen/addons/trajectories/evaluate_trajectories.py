@@ -193,16 +193,13 @@ def evaluate_trajectories(
     if interpolation is not None and max_jerk is not None:
         text = "interpolation and max_jerk exclude each other"
         raise UsageError(text, concerns="interpolation")
-    jitter = None
-    if time_jitter is not None:
-        jitter = float(non_negative("time_jitter", time_jitter, 1)[0])
     n = len(record.joint_names)
     task = partial(
         _judge,
         record=record,
         interpolation=interpolation,
         noise=None if noise is None else non_negative("noise", noise, 3),
-        jitter=jitter,
+        jitter=_seconds("time_jitter", time_jitter),
         max_jerk=None if max_jerk is None else non_negative("max_jerk", max_jerk, n),
         step=step,
     )
@@ -282,6 +279,10 @@ def non_negative(name: str, value: ArrayLike, size: int) -> Array:
             argument=name,
         )
     return np.broadcast_to(found, (size,)).astype(float)
+
+
+def _seconds(name: str, value: float | None) -> float | None:
+    return None if value is None else float(non_negative(name, value, 1)[0])
 
 
 def _judge(  # noqa: PLR0917 - the arguments of evaluate_trajectories

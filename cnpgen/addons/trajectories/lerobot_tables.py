@@ -79,11 +79,10 @@ def read_lerobot(folder: Path) -> Iterator[TrajectoryTable]:
         count += len(t)
         columns: dict[str, Values] = {MESSAGE_TIME: t}
         columns |= {name: read[key][:, k] for k, name in enumerate(names)}
-        columns |= {
-            name: read[LEROBOT_ENVIRONMENT][:, k] for name, k in parameters.items()
-        }
+        around = read.get(LEROBOT_ENVIRONMENT, np.empty((len(t), 0)))
+        columns |= {name: around[:, k] for name, k in parameters.items()}
         if scene:
-            columns[OBSTACLE_POSES] = read[LEROBOT_ENVIRONMENT][:, scene]
+            columns[OBSTACLE_POSES] = around[:, scene]
         place = f"{folder}: episode {episode:g}"
         columns[MESSAGE_TIME] = _frame_times(place, t, info.get("fps"))
         yield TrajectoryTable(place, columns, unused=tuple(unused))

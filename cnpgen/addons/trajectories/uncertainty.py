@@ -171,8 +171,7 @@ def _changes(  # noqa: PLR0917 - as of uncertainty_of
     random = np.random.default_rng(0)
     for _ in range(COMBINATIONS):
         offsets = [bound * random.choice([-1.0, 1.0], bound.shape) for bound in bounds]
-        # Effects of several values may exceed the sum of single ones where they
-        # interact.
+        # Values that interact may have more effect than the sum of their single ones.
         for row, change in zip(total, changes(offsets), strict=True):
             np.maximum(row, change, out=row)
     return [

@@ -101,8 +101,7 @@ def fitted(
         return kept
 
     at = np.full(chosen.shape[1], np.nan)  # exponents
-    # Weights fall by powers of ten. The first one that keeps a joint within its errors
-    # is the smoothest of them.
+    # Weights fall by powers of ten: the first one within the errors is the smoothest.
     for exponent in EXPONENTS:
         at[keep(exponent, np.isnan(at))] = exponent
         if not np.isnan(at).any():

@@ -178,11 +178,8 @@ class Judge:
             )
         (states, samples), world = sampled, self._world
         if not states.is_finite():
-            return Verdict(
-                Reason.NOT_FINITE,
-                metrics=Metrics(duration=float(samples.t[-1])),
-                samples=len(samples.s),
-            )
+            metrics = Metrics(duration=float(samples.t[-1]))
+            return Verdict(Reason.NOT_FINITE, metrics=metrics, samples=len(samples.s))
         # With early exit, a lower bound that proves a sufficient distance takes the
         # place of the exact smallest one.
         world.set_path(

@@ -265,11 +265,8 @@ def braking_step(robot: Robot, *, height: float) -> Any:
     # On the manifold z'' = J_z ddq + dJ_z dq = 0; a stable feedback of vertical speed
     # and height error removes the rounding of earlier steps:
     #   z'' = -z' / (2 T) - (z - height) / (10 T^2).
-    target = (
-        -bias[2]
-        - 0.5 * velocity[2] / BRAKING_STEP_S
-        - 0.1 * (kin.tip[2] - height) / BRAKING_STEP_S**2
-    )
+    feedback = 0.5 * velocity[2] / BRAKING_STEP_S
+    target = -bias[2] - feedback - 0.1 * (kin.tip[2] - height) / BRAKING_STEP_S**2
     low, high = _acceleration_box(robot, dq)
     # The largest deceleration along the normal: maximize -n . J ddq.
     ddq = _knapsack([-x for x in along], row, target, low, high)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import replace
 
 import numpy as np
@@ -69,10 +69,22 @@ def placed_scene(scene: SceneProblem, robot: Robot, start: Array) -> SceneProble
     others = tuple(_moved_goal(pose, frame, frames) for pose, frame in pairs)
     for link, *_ in request.link_sizes:
         frames.check_link(link, "a padding or scale")
-    carried = tuple(_in_link(each, request, frames) for each in request.attached)
-    constraints = tuple(_in_world(request, frames))
-    # All poses are placed now: a second placement changes nothing.
-    plain: SceneRequest = replace(
+    placed = replace(
+        scene,
+        obstacles=tuple(obstacles),
+        goal_pose=goal,
+        other_goal_poses=others,
+        request=_placed_request(request, frames, touchable),
+    )
+    return checked_scene(placed)
+
+
+def _placed_request(
+    request: SceneRequest, frames: LinkFrames, touchable: Iterable[AttachedObject]
+) -> SceneRequest:
+    """Return a request without frames, whose second placement changes nothing."""
+    carried = (_in_link(each, request, frames) for each in request.attached)
+    return replace(
         request,
         obstacle_frames=(),
         obstacle_touch_links=(),
@@ -80,17 +92,9 @@ def placed_scene(scene: SceneProblem, robot: Robot, start: Array) -> SceneProble
         other_goal_frames=(),
         fixed_frames=(),
         attached=(*carried, *touchable),
-        constraints=constraints,
+        constraints=tuple(_in_world(request, frames)),
         constraint_frames=(),
     )
-    placed = replace(
-        scene,
-        obstacles=tuple(obstacles),
-        goal_pose=goal,
-        other_goal_poses=others,
-        request=plain,
-    )
-    return checked_scene(placed)
 
 
 def _placed_obstacles(

@@ -58,16 +58,9 @@ def requested_problem(
             mass or no place in the problem.
         UsageError: ``payload`` is out of range.
     """
-    if payload is not None:
-        mass = number("payload", payload)
-        check_range("payload", mass, MIN_PAYLOAD_KG, MAX_PAYLOAD_KG, "kg")
-        attached = scenes[0].request.attached
-        if all(item.mass or not item.link for item in attached):
-            _LOG.warning(
-                "the payload of %g kg is not used: no scene attaches an object of weight 0",
-                payload,
-            )
     first = scenes[0]
+    if payload is not None:
+        _check_payload(payload, first)
     _report_held_joints(problem, scenes)
     # Plans of one call share limits, links and constraints, hence one problem.
     for scene in scenes:
@@ -90,6 +83,17 @@ def requested_problem(
     actual = load_robot(changed)
     _check_contacts(actual, first)
     return changed, actual, [_without_changes(scene) for scene in scenes]
+
+
+def _check_payload(payload: float, scene: SceneProblem) -> None:
+    """Raise UsageError if a payload is out of range, and warn if no attached object needs it."""
+    mass = number("payload", payload)
+    check_range("payload", mass, MIN_PAYLOAD_KG, MAX_PAYLOAD_KG, "kg")
+    if all(item.mass or not item.link for item in scene.request.attached):
+        _LOG.warning(
+            "the payload of %g kg is not used: no scene attaches an object of weight 0",
+            payload,
+        )
 
 
 def _report_held_joints(problem: Problem, scenes: Sequence[SceneProblem]) -> None:

@@ -184,8 +184,7 @@ def _solved(
     facets = len(normals)
     zeros = np.zeros_like(normals)
     linear = np.block([[-normals, zeros], [zeros, -normals]])
-    # Unknowns: both ends (6), radius r and excess t. The facets' constraints are
-    # linear.
+    # Unknowns: both ends (6), radius r, excess t; constraints of facets are linear.
     zero = np.zeros((2 * facets, 1))
     one = np.ones((2 * facets, 1))
     facet_gradients = np.concatenate([linear, zero, one], axis=1)

@@ -78,10 +78,8 @@ class TensorBoundaryLayer:
         state = {
             name: torch.tensor(values, **kind) for name, values in conditions.items()
         }
-        rate = (
-            log_rate.to(**kind).exp()
-            / torch.tensor(tasks.expected_time, **kind)[:, None]
-        )
+        expected_time = torch.tensor(tasks.expected_time, **kind)
+        rate = log_rate.to(**kind).exp() / expected_time[:, None]
         first = start_points(
             state["start_q"], state["start_dq"], state["start_ddq"], rate, spec
         )
