@@ -12,7 +12,7 @@ from functools import cache
 
 import numpy as np
 
-from cnpgen.kernels.steps import ArithmeticStep
+from cnpgen.kernels.steps import UNUSED, ArithmeticStep
 from cnpgen.kernels.tape import Tape
 
 Read = Callable[[int, str, int, int], str]  # step, its name, argument, component
@@ -176,10 +176,10 @@ class StepText:
         for k, step in enumerate(steps):
             name = f"%t{k}"
             operands = step.operands
-            if step.operation == "constant":
-                names.append(self.number(step.value))
+            constant = step.operation == "constant"
+            names.append(self.number(step.value) if constant else name)
+            if constant or step is UNUSED:
                 continue
-            names.append(name)
             if step.operation == "input":
                 lines.append(read(k, name, *operands))
             elif step.operation == "output":

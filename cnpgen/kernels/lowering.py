@@ -5,14 +5,14 @@ contracted to fused multiply-adds by a rule of the tape alone. So every vector w
 optimization level and instruction set rounds in the same places and gives equal bits.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from cnpgen.kernels.kernel import axis_names
-from cnpgen.kernels.steps import ArithmeticStep, StepList
+from cnpgen.kernels.steps import UNUSED, ArithmeticStep, StepList
 from cnpgen.kernels.tape import NAMES, Tape
 from cnpgen.kernels.vector_functions import exponential, sine_and_cosine
 
@@ -22,6 +22,7 @@ STATEMENTS = {  # of C for a step; 1 for those that are not listed
     "constant": 0, "input": 0, "output": 0, "min": 6, "max": 6, "lt": 2, "le": 2, "eq": 2, "ne": 2, "not": 2,
     "if_else_zero": 3, "and": 6, "or": 6, "sign": 8,
 }  # fmt: skip
+SOURCES = "input", "constant"  # steps without operands
 ARITHMETIC = {
     "ADD": "add", "SUB": "sub", "MUL": "mul", "DIV": "div", "NEG": "neg", "SQRT": "sqrt", "FABS": "abs",
     "SIGN": "sign", "LT": "lt", "LE": "le", "EQ": "eq", "NE": "ne", "NOT": "not",
@@ -30,7 +31,7 @@ ARITHMETIC = {
 
 
 def lower(tape: Tape) -> list[ArithmeticStep]:
-    """Return the steps of a tape, contracted, without those that no result needs."""
+    """Return the steps of a tape, contracted; those that no result needs become ``UNUSED``."""
     # Instructions are entered in order, so operands are known when they are read.
     # ``StepList`` merges equal operations at once, which keeps its work linear in the
     # length of the tape.
@@ -63,7 +64,8 @@ def lower(tape: Tape) -> list[ArithmeticStep]:
     # its uses, and ``_contracted`` counts only those that a result needs.
     if len(tape) <= MAX_CONTRACTED:
         steps = _contracted(tape, steps)
-    return _without_unused(steps)
+    needed = _needed(steps)
+    return [step if used else UNUSED for step, used in zip(steps, needed, strict=True)]
 
 
 def _lower_operation(steps: StepList, name: str, a: int, b: int) -> int:
@@ -105,7 +107,7 @@ def uniform_arguments(tape: Tape) -> set[int]:
 
 def value_operands(step: ArithmeticStep) -> tuple[int, ...]:
     """Return the steps that a step reads."""
-    if step.operation in ("input", "constant"):
+    if step.operation in SOURCES:
         return ()
     return step.operands[:1] if step.operation == "output" else step.operands
 
@@ -118,7 +120,7 @@ def _contracted(tape: Tape, steps: list[ArithmeticStep]) -> list[ArithmeticStep]
     first one is contracted.
     """
     steps = list(steps)
-    needed = _needed(steps)
+    needed = [index for index, used in enumerate(_needed(steps)) if used]
     section = _sections(tape, steps, needed)
     # uses[i] lists the steps that read step i, once for each occurrence as an operand.
     uses: list[list[int]] = [[] for _ in steps]
@@ -181,7 +183,7 @@ def _computed_before_loop(steps: list[ArithmeticStep]) -> NDArray[np.integer[Any
         if step.operation == "input":
             before.append(step.operands[0] != 0)
         else:
-            before.append(all(before[operand] for operand in value_operands(step)))
+            before.append(all(map(before.__getitem__, value_operands(step))))
     return np.array(before, int)
 
 
@@ -199,30 +201,15 @@ def _fused(
     return ArithmeticStep("fma", (*factors, first), signs=(minus, False))
 
 
-def _needed(steps: list[ArithmeticStep]) -> list[int]:
-    """Return the indices of the steps that some result needs, in order."""
-    needed = np.array([step.operation == "output" for step in steps], bool)
+def _needed(steps: list[ArithmeticStep]) -> list[bool]:
+    """Return whether some result needs each step."""
+    needed = [False] * len(steps)
     # Backwards, so that all uses of a step are visited before the step itself.
     for index in range(len(steps) - 1, -1, -1):
-        if needed[index]:
-            needed[list(value_operands(steps[index]))] = True
-    return np.flatnonzero(needed).tolist()
-
-
-def _without_unused(steps: list[ArithmeticStep]) -> list[ArithmeticStep]:
-    """Return the needed steps with their operands renumbered."""
-    needed = _needed(steps)
-    renumbered = dict(zip(needed, range(len(needed)), strict=True))
-    return list(_renumbered([steps[index] for index in needed], renumbered))
-
-
-def _renumbered(
-    steps: list[ArithmeticStep], index: dict[int, int]
-) -> Iterator[ArithmeticStep]:
-    for step in steps:
-        count = len(value_operands(step))
-        operands = (
-            *(index[operand] for operand in step.operands[:count]),
-            *step.operands[count:],
-        )
-        yield ArithmeticStep(step.operation, operands, step.value, step.signs)
+        operation, operands, *_ = steps[index]
+        if operation == "output":
+            needed[index] = needed[operands[0]] = True
+        elif needed[index] and operation not in SOURCES:
+            for operand in operands:
+                needed[operand] = True
+    return needed

@@ -1,8 +1,7 @@
 """Arithmetic steps on vectors: what a tape becomes before it is machine code."""
 
+from struct import pack
 from typing import Any, NamedTuple
-
-import numpy as np
 
 COMMUTATIVE = {"add", "mul", "eq", "ne", "and", "or"}
 
@@ -12,7 +11,7 @@ class ArithmeticStep(NamedTuple):
 
     Attributes:
         operation: Its name: an entry of ``llvm_text.TEMPLATES``, "constant", "input",
-            "output" or "fma".
+            "output", "fma" or "unused".
         operands: Indices of earlier steps; of an input: argument and component; of an
             output: the value, result and component; of "fma": a, b, c of ``a b + c``.
         value: The number of a constant.
@@ -23,6 +22,9 @@ class ArithmeticStep(NamedTuple):
     operands: tuple[int, ...] = ()
     value: float = 0.0
     signs: tuple[bool, bool] = (False, False)
+
+
+UNUSED = ArithmeticStep("unused")  # has no code
 
 
 class StepList:
@@ -46,7 +48,7 @@ class StepList:
         """Return the index of a constant."""
         return self._enter(
             # By bits, since 0.0 == -0.0 and nan != nan.
-            np.float64(value).tobytes(),
+            pack("d", value),
             ArithmeticStep("constant", (), value),
         )
 
