@@ -17,9 +17,9 @@ from dataclasses import replace
 import numpy as np
 
 from cnpgen.arrays import Array
+from cnpgen.kernels.collision.collision_checker import MAX_JOINTS
 from cnpgen.refine.grid_levels import MAX_INITIAL_VIOLATION
 from cnpgen.refine.refiner import Refiner
-from cnpgen.refine.rrt_connect import TreeSearch, find_paths
 from cnpgen.refine.solver.hulls import has_clearance_constraints
 from cnpgen.refine.solver.sqp import Result
 from cnpgen.refine.task import MAX_JUDGED_VIOLATION, Attempt, Outcome, RefinementTask
@@ -83,7 +83,7 @@ def _all_attempts(
         return
     if has_clearance_constraints(refiner.problem, refiner.robot):
         yield from around_obstacles(refiner, task, best)
-    elif task.at_rest:
+    elif task.at_rest and refiner.robot.n <= MAX_JOINTS:
         for guess in path_guesses(refiner, task):
             yield along_path(refiner, task, guess)
 
@@ -334,17 +334,7 @@ def _on_hulls(
 
 def path_guesses(refiner: Refiner, task: RefinementTask) -> Iterator[Attempt]:
     """Yield motions along valid joint-space paths, scaled in time if they are from rest to rest."""
-    space = refiner.rest_space(task)
-    if refiner.measures_hulls:
-        paths = TreeSearch(task, space, refiner.hulls, refiner.manifold(task)).paths()
-    else:
-        paths = find_paths(
-            task.boundary.start_q[0],
-            task.boundary.goal_q[0],
-            refiner.robot,
-            space.follow,
-        )
-    for states in paths:
+    for states in refiner.tree_search(task).paths():
         guess = refiner.path_guess(task, states)
         yield refiner.measured(task, guess, Outcome.RESTARTED, unlimited=True)
 

@@ -5,7 +5,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from cnpgen.arrays import Array, Mask
+from cnpgen.arrays import Array
+from cnpgen.kernels.collision.tree_search import RestConditions
 from cnpgen.problems.problem import Problem
 from cnpgen.refine.solver.bounds import NO_TIGHTENING, bounds_template
 from cnpgen.refine.solver.grid import make_grid
@@ -57,6 +58,8 @@ class FineCheck:
         penetration: Callable[[RefinementTask, Array], float] | None = None,
     ) -> None:
         self._penetration = penetration
+        self._kernels = kernels
+        self._poses = poses
         self._grid = make_grid(kernels.spec, FINE_POINTS, problem.path_orders)
         self.transcription = cache_last(
             lambda task: Transcription(
@@ -125,11 +128,10 @@ class FineCheck:
         position = collision > 1 or bool(violated[:, self._bounds.orders == 0].any())
         return cost, GridViolation(max(worst, collision), position, time_scale)
 
-    def rest_bounds(self, task: RefinementTask) -> tuple[Array, Array, Mask, Mask]:
-        """Return bounds of a robot at rest halfway along the motion, relaxed by tolerances except for clearances.
+    def at_rest(self, task: RefinementTask, *, with_capsules: bool) -> RestConditions:
+        """Return the conditions of a robot at rest halfway along the motion, relaxed by tolerances except for clearances.
 
-        The result is ``(lower, upper, capsules, equal)``, see
-        ``cnpgen.refine.rrt_connect.RestSpace``.
+        Without capsules the clearances of the links do not hold.
         """
         bounds = self._bounds.bounds_for(task.start_xyz)
         half = FINE_POINTS // 2
@@ -137,12 +139,19 @@ class FineCheck:
         tolerances = np.where(
             capsules | self._bounds.held_clearances, 0.0, self._bounds.tolerances
         )
-        equal = self._bounds.equal & (self._bounds.orders == 0)
-        return (
+        if not with_capsules:
+            tolerances = np.where(capsules, np.inf, tolerances)
+        values = self._kernels.values
+        width, n = values.tape.inputs[0], task.boundary.start_q.shape[1]
+        w = np.zeros(width)
+        # The rate follows the orders of the path, w = (p, p', ..., r, r', ...).
+        w[(width + 1) // (n + 1) * n] = 1.0
+        return RestConditions(
+            values,
+            w,
+            self._poses(task),
             bounds.lower[half] - tolerances,
             bounds.upper[half] + tolerances,
-            capsules,
-            equal,
         )
 
     def speed_ratio(self, task: RefinementTask, x: Array) -> float:

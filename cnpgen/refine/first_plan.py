@@ -19,7 +19,6 @@ import numpy as np
 from cnpgen.arrays import Array
 from cnpgen.refine.initial_guesses import SAMPLES_PER_CONTROL_POINT
 from cnpgen.refine.refiner import Refiner
-from cnpgen.refine.rrt_connect import TreeSearch
 from cnpgen.refine.strategy import PlanChecker, RefinementSearch, refine_task
 from cnpgen.refine.task import MAX_JUDGED_VIOLATION, Attempt, Outcome, RefinementTask
 from cnpgen.trajectory.spline import basis, clamped_knots
@@ -87,9 +86,7 @@ def _guesses(refiner: Refiner, task: RefinementTask) -> Iterator[Array]:
         yield refiner.line_guess(task)
         yield from refiner.other_guesses(task)
         return
-    space = refiner.rest_space(task)
-    manifold = refiner.manifold(task)
-    for states in TreeSearch(task, space, refiner.hulls, manifold).first_paths():
+    for states in refiner.tree_search(task).first_paths():
         yield refiner.path_guess(task, states)
 
 

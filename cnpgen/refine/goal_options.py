@@ -20,7 +20,6 @@ from cnpgen.plans.plans import Plans
 from cnpgen.problems.constraints.joint import JointVelocity
 from cnpgen.problems.problem_record import open_problem
 from cnpgen.refine.refiner import Refiner
-from cnpgen.refine.rrt_connect import TreeSearch
 from cnpgen.refine.task import Attempt, RefinementTask
 
 # Called with plans finished and valid since the last call.
@@ -96,10 +95,7 @@ def order_by_tree(refiner: Refiner, tasks: Sequence[RefinementTask]) -> list[int
     ):
         return kept
     goals = np.concatenate([task.boundary.goal_q for task in tasks])
-    space = refiner.rest_space(first)
-    manifold = refiner.manifold(first)
-    search = TreeSearch(first, space, refiner.hulls, manifold, goals)
-    for path in search.first_paths():
+    for path in refiner.tree_search(first, goals).first_paths():
         # A path ends in one of the goals, whose difference is zero.
         reached = int(np.abs(goals - path[-1]).max(axis=1).argmin())
         return [reached, *(index for index in kept if index != reached)]

@@ -4,7 +4,9 @@
 """
 
 from collections.abc import Iterator
+from ctypes import CDLL
 from dataclasses import replace
+from functools import cached_property
 from threading import get_ident
 
 import numpy as np
@@ -12,6 +14,7 @@ import numpy as np
 from cnpgen.arrays import Array
 from cnpgen.kernels.collision.collision_checker import load_collision_library
 from cnpgen.kernels.collision.tree_search import EqualityKernel
+from cnpgen.kernels.kernel import Kernel
 from cnpgen.kernels.library import KernelLibrary, choose_backend, problem_kernels
 from cnpgen.problems.conditions import equality_residuals
 from cnpgen.problems.obstacles import table_frame_of
@@ -20,7 +23,7 @@ from cnpgen.refine import initial_guesses
 from cnpgen.refine.fine_check import FineCheck
 from cnpgen.refine.grid_levels import GridLevel, GridLevels, default_grid_levels
 from cnpgen.refine.options import DEFAULT_OPTIONS, RefineOptions
-from cnpgen.refine.rrt_connect import RestSpace
+from cnpgen.refine.rrt_connect import TreeSearch
 from cnpgen.refine.solver.bounds import (
     Bounds,
     accepted_along,
@@ -103,8 +106,9 @@ class Refiner:
         # The hulls of each thread.
         self._hulls = dict[int, Hulls]()
         self.measures_hulls = can_measure_hulls(problem, robot, self._world)
-        if self.measures_hulls or has_clearance_constraints(problem, robot):
-            self._library = load_collision_library(kernels)
+        # Hulls decide where a robot has link geometry, in rows of the solver or in
+        # paths.
+        self._has_hulls = has_clearance_constraints(problem, robot)
         solved = problem
         if self.measures_hulls:
             # Distances become rows of the compiled hulls: the symbolic kernels do not
@@ -113,14 +117,15 @@ class Refiner:
             kernels = problem_kernels(
                 solved, robot, kernels.backend, kernels.cache_folder
             )
+        self._kernels = kernels
         others = pose_width(problem.obstacle) - pose_width(solved.obstacle)
         self._kernel_poses = slice(others, None)
         cost_term = choose_cost_term(problem, options.objective, options.weight)
         self.residual_kernels = _residual_kernels(self.spec, kernels, robot, cost_term)
-        self._prepare_check(solved, kernels)
+        self._prepare_check(solved)
         self._prepare_levels(solved, levels)
 
-    def _prepare_check(self, solved: Problem, kernels: KernelLibrary) -> None:
+    def _prepare_check(self, solved: Problem) -> None:
         """Prepare the check on the fine grid, by the kernels of the problem that is solved."""
         self.check = FineCheck(
             solved,
@@ -128,10 +133,6 @@ class Refiner:
             self.residual_kernels,
             poses=self.kernel_poses,
             penetration=self.penetration if self.measures_hulls else None,
-        )
-        has_manifold = self.measures_hulls and self.check.projects
-        self._equalities = (
-            kernels.load_by_structure(equality_residuals) if has_manifold else None
         )
         # by how much the hulls at both ends violate their distances within the
         # tolerance [m], shape (2, m)
@@ -469,27 +470,36 @@ class Refiner:
             else np.concatenate([interior.ravel(), np.log(rate / (SLOWNESS * factor))])
         )
 
-    def rest_space(self, task: RefinementTask) -> RestSpace:
-        """Return the valid states at rest, for the search of joint-space paths."""
-        poses = self.kernel_poses(task)
-        hulls = (
-            self.hulls if has_clearance_constraints(self.problem, self.robot) else None
-        )
-        bounds = self.check.rest_bounds(task)
-        return RestSpace(
-            self.residual_kernels,
+    def tree_search(
+        self, task: RefinementTask, goals: Array | None = None
+    ) -> TreeSearch:
+        """Return the search for joint-space paths of a task, to any of several goals if there are, shape (G, n)."""
+        hulls = self.hulls if self.measures_hulls or self._has_hulls else None
+        return TreeSearch(
+            task,
             self.robot,
-            *bounds,
-            poses,
-            task.scene.poses[0],
+            self._library,
+            self.check.at_rest(task, with_capsules=hulls is None),
+            self.manifold(task),
             hulls,
+            self.measures_hulls,
+            goals,
         )
 
     def manifold(self, task: RefinementTask) -> EqualityKernel | None:
-        """Return the equalities that compiled trees keep, or None if there are none."""
-        if self._equalities is None or not self._equalities.tape.outputs[0]:
+        """Return the equalities that trees keep, or None if there are none."""
+        if not self.check.projects or not self.equalities.tape.outputs[0]:
             return None
-        return EqualityKernel(self._equalities, self.kernel_poses(task))
+        return EqualityKernel(self.equalities, self.kernel_poses(task))
+
+    @cached_property
+    def equalities(self) -> Kernel:
+        """The kernel of ``equality_residuals``, which only searches for paths need."""
+        return self._kernels.load_by_structure(equality_residuals)
+
+    @cached_property
+    def _library(self) -> CDLL:
+        return load_collision_library(self._kernels)
 
     @property
     def hulls(self) -> Hulls:

@@ -66,7 +66,9 @@ def load_kernels(name: str) -> None:
     pipeline = load_dataset_recipe(name).pipeline
     backend, cache = library.choose_backend(None)
     problem = PreparedPipeline(pipeline, backend=backend, cache_folder=cache).context.problem  # fmt: skip
-    Refiner(problem, load_robot(problem))
+    refiner = Refiner(problem, load_robot(problem))
+    if refiner.check.projects:
+        assert refiner.equalities.tape.inputs
     if (ROOT / f"datasets/models/{name}.h5").exists():
         Planner(name)
 

@@ -1,7 +1,8 @@
-"""Compiled RRT-Connect: clear by Coal, reproducible, shortened, and absent where no path exists."""
+"""Compiled RRT-Connect: clear by Coal, at rest within bounds, reproducible, shortened, and absent where no path exists."""
 
 from itertools import pairwise
 
+import casadi
 import numpy as np
 import pytest
 
@@ -10,12 +11,17 @@ from cnpgen.kernels.collision.collision_checker import (
     load_collision_library,
 )
 from cnpgen.kernels.collision.tree_search import (
+    RestConditions,
     TreeSettings,
     estimated_duration,
     find_tree_path,
 )
+from cnpgen.kernels.compiled_kernel import CompiledKernel
+from cnpgen.kernels.interpreted_kernel import InterpretedKernel
 from cnpgen.kernels.library import KernelLibrary, choose_backend
+from cnpgen.kernels.tape import tape_from_function
 from cnpgen.problems.load_robot import load_robot
+from cnpgen.refine.rrt_connect import NO_SHAPE
 from cnpgen.robots.solid import place_obstacles
 from tests.conftest import needs_compiler
 from tests.examples.coal_hulls import CoalHulls
@@ -137,3 +143,66 @@ def test_a_clear_line_is_the_path(setting):
 def test_no_path_leads_into_an_obstacle(setting):
     inside = np.array([BESIDE_WALL[0], [0.0, -0.1, 0.4, 0.0]])
     assert search(setting, ends=inside, max_extensions=300) is None
+
+
+GATE_WIDTH, GATE_HEIGHT = (
+    0.2,
+    0.5,
+)  # states of a thin wall with q_0 near 0 need a large q_1
+
+
+@pytest.fixture(scope="module")
+def gate(setting):
+    """Tape of ``(q, r, scene) -> (distance from the wall, q_2, 1 / r)``, where r is 1 at rest."""
+    q, scene = casadi.SX.sym("q", 5), casadi.SX.sym("scene", 1)
+    wall = casadi.fmax(casadi.fabs(q[0]) - GATE_WIDTH, q[1] - scene)
+    g = casadi.vertcat(wall, q[2], 1 / q[4])
+    return tape_from_function(casadi.Function("gate", [q, scene], [casadi.densify(g)]))
+
+
+def search_at_rest(setting, residuals, seed=0, lower=0.0, scene=GATE_HEIGHT):
+    """Search for a path of a robot without link geometry, whose states keep bounds only."""
+    _, robot, checker = setting
+    rest = RestConditions(
+        residuals,
+        np.eye(5)[4],
+        np.array([scene]),
+        np.array([lower, -np.inf, 1.0]),
+        np.array([np.inf, 0.6, 1.0]),
+    )
+    return find_tree_path(
+        CollisionChecker(checker.library, robot, NO_SHAPE),
+        tuple(BESIDE_WALL),
+        (robot.position_lower, robot.position_upper),
+        robot.velocity_limit,
+        TreeSettings(None, None),
+        seed=seed,
+        at_rest=rest,
+    )
+
+
+def test_states_at_rest_keep_the_bounds_of_a_kernel(setting, gate):
+    compiled = CompiledKernel(gate, choose_backend("compiled")[1])
+    path = search_at_rest(setting, compiled)
+    assert len(path) > 2
+    q = along(path)
+    beside = (np.abs(q[0]) > GATE_WIDTH) | (q[1] > GATE_HEIGHT)
+    assert (np.abs(q[0, ~beside]) > GATE_WIDTH - 0.03).all()  # between checked states
+    assert q[2].max() < 0.63
+    np.testing.assert_array_equal(path, search_at_rest(setting, compiled))
+    np.testing.assert_array_equal(
+        path, search_at_rest(setting, InterpretedKernel(gate))
+    )
+    assert not np.array_equal(path, search_at_rest(setting, compiled, seed=1))
+
+
+def test_a_line_within_the_bounds_at_rest_is_the_path(setting, gate):
+    residuals = CompiledKernel(gate, choose_backend("compiled")[1])
+    path = search_at_rest(setting, residuals, scene=-1.0)
+    np.testing.assert_array_equal(path, BESIDE_WALL)
+
+
+@pytest.mark.parametrize("values", [{"scene": 10.0}, {"scene": np.nan, "lower": 0.1}])
+def test_no_path_leads_through_bounds_or_nan(setting, gate, values):
+    residuals = CompiledKernel(gate, choose_backend("compiled")[1])
+    assert search_at_rest(setting, residuals, **values) is None

@@ -58,6 +58,17 @@ def make_hulls(request):
     return {"coal": CoalHulls, "compiled": compiled_hulls}[request.param]
 
 
+def clear_states(hulls, q: np.ndarray, poses: np.ndarray):
+    """Return a mask of the states that Coal, or the checker of trees, finds clear."""
+    if isinstance(hulls, CoalHulls):
+        return hulls.clear_states(q.T.copy(), poses)
+    return hulls.placed_checker(poses).clear_states(
+        q.T,
+        obstacle_distance=hulls.obstacle_distance,
+        self_distance=hulls.self_distance,
+    )
+
+
 @needs_compiler
 def test_distances_agree_with_meshes(tmp_path, make_hulls):
     problem = load_problem(write_problem(tmp_path))
@@ -73,7 +84,7 @@ def test_distances_agree_with_meshes(tmp_path, make_hulls):
     assert in_range.sum() > 15
     assert np.abs(found - expected)[in_range].max() < 1e-4  # round parts are prisms
     assert (found[expected > MEASURED_RANGE_M + 1e-4] == MEASURED_RANGE_M).all()
-    assert np.array_equal(hulls.clear_states(q.T.copy(), obstacle_poses), found >= 0)
+    assert np.array_equal(clear_states(hulls, q, obstacle_poses), found >= 0)
     assert hulls.violation(q.T.copy(), obstacle_poses) == pytest.approx(
         -found.min(), abs=1e-9
     )
@@ -217,10 +228,10 @@ def test_distances_of_the_held_object_are_those_of_the_verdict(
     assert (around < 0.01).sum() > 10
     enters = expected.min(axis=1) < -0.003
     assert 3 < enters.sum() < 290
-    clear = hulls.clear_states(q.T.copy(), poses)
+    clear = clear_states(hulls, q, poses)
     assert not clear[enters].any()
     free = (found[:, held].min(axis=1) >= -0.002) & (nearest >= 0.01)
-    np.testing.assert_array_equal(clear, links.clear_states(q.T.copy(), poses) & free)
+    np.testing.assert_array_equal(clear, clear_states(links, q, poses) & free)
 
 
 @needs_compiler
@@ -356,7 +367,7 @@ def test_large_trees_follow_the_first_ones(monkeypatch):
         set[int](),
     )  # hits: numbers of the trees that find a path
 
-    def find(checker, ends, box, velocity, settings, *, seed, manifold):
+    def find(checker, ends, box, velocity, settings, *, seed, manifold, at_rest):
         if not settings.max_extensions:
             return None  # the straight line collides
         grown.append(settings)
@@ -366,7 +377,7 @@ def test_large_trees_follow_the_first_ones(monkeypatch):
     robot = SimpleNamespace(
         position_lower=-np.ones(2), position_upper=np.ones(2), velocity_limit=np.ones(2)
     )
-    space = SimpleNamespace(robot=robot, meets_other_conditions=lambda _: True)
+    monkeypatch.setattr(rrt_connect, "meets_at_rest", lambda *_: True)
     hulls = SimpleNamespace(
         obstacle_distance=0.0, self_distance=0.0, placed_checker=lambda _: None
     )
@@ -374,7 +385,7 @@ def test_large_trees_follow_the_first_ones(monkeypatch):
     task = SimpleNamespace(
         boundary=boundary, scene=SimpleNamespace(poses=np.zeros((1, 0)))
     )
-    search = rrt_connect.TreeSearch(task, space, hulls, None)
+    search = rrt_connect.TreeSearch(task, robot, None, None, None, hulls, True)
     cases = (
         ({0, 1, 3}, (12, 0, 12)),  # small trees with every margin find enough paths
         (set(), (4, 3, 3)),  # nothing connects

@@ -1,21 +1,12 @@
-"""Joint-space paths around obstacles: free of collisions by meshes, reproducible, and needed by some tasks."""
-
-from collections.abc import Callable
+"""Motions along joint-space paths around obstacles: free of collisions by meshes, and needed by some tasks."""
 
 import numpy as np
 import pytest
 
 from cnpgen.problems.load_robot import load_robot
 from cnpgen.problems.problem import Problem
-from cnpgen.refine import attempts, rrt_connect
+from cnpgen.refine import attempts
 from cnpgen.refine.initial_guesses import fit_to_path
-from cnpgen.refine.rrt_connect import (
-    Follow,
-    RestSpace,
-    find_path,
-    find_paths,
-    follow_line,
-)
 from cnpgen.refine.strategy import PlanChecker, refine_task
 from cnpgen.refine.task import Outcome
 from cnpgen.trajectory.boundary import assemble
@@ -30,78 +21,6 @@ pytestmark = needs_compiler
 @pytest.fixture(scope="module")
 def wall(tmp_path_factory: pytest.TempPathFactory) -> Problem:
     return narrow(tmp_path_factory.mktemp("wall"), WALL)
-
-
-def space_of(problem: Problem) -> RestSpace:
-    return refiner(problem).rest_space(between(problem, BESIDE_WALL))
-
-
-def until(collides: Callable[[np.ndarray], np.ndarray]) -> Follow:
-    """Follow states up to the first one that collides."""
-
-    def follow(q: np.ndarray) -> np.ndarray:
-        collisions = collides(q)
-        return q[:, : int(np.argmax(collisions))] if collisions.any() else q
-
-    return follow
-
-
-def test_a_path_over_a_wall_is_free_of_collisions(wall):
-    robot, follow = load_robot(wall), space_of(wall).follow
-    assert not follow_line(*BESIDE_WALL, follow)[1]
-    path = find_path(*BESIDE_WALL, robot, follow, seed=0)
-    assert np.array_equal(path[[0, -1]], BESIDE_WALL)
-    assert np.abs(np.diff(path, axis=0)).max() < 1.001 * rrt_connect.STATE_SPACING
-    meshes = Meshes(wall, robot, wall.path.parent)
-    states = np.concatenate(
-        [path, (path[1:] + path[:-1]) / 2]
-    )  # the checked states, and their midpoints
-    assert min(min(meshes.distances(q)) for q in states) > -0.01
-
-
-def test_a_line_is_free_up_to_the_first_state_that_is_not():
-    sizes = []
-
-    def follow(q: np.ndarray) -> np.ndarray:
-        sizes.append(q.shape[1])
-        return until(lambda q: q[0] > 1.5)(q)
-
-    states, reached = follow_line(np.zeros(2), np.array([1.4, 1.0]), follow)
-    assert reached
-    np.testing.assert_array_equal(states[-1], [1.4, 1.0])
-    states, reached = follow_line(np.zeros(2), np.array([3.0, 1.0]), follow)
-    assert not reached
-    assert 1.5 - rrt_connect.STATE_SPACING < states[-1, 0] <= 1.5
-    assert max(sizes) <= rrt_connect.STATES_PER_CHECK
-
-
-def test_a_line_ends_where_its_states_are_not_close():
-    states, reached = follow_line(
-        np.zeros(2), np.ones(2), lambda q: np.where(q > 0.5, q + 1.0, q)
-    )
-    assert not reached
-    assert 0.5 - rrt_connect.STATE_SPACING < states.max() <= 0.5
-
-
-def test_no_path_is_found_if_there_is_none(wall, monkeypatch):
-    monkeypatch.setattr(rrt_connect, "MAX_EXTENSIONS", 50)
-    closed = until(lambda q: np.abs(q[0]) < 0.1)
-    assert list(find_paths(*BESIDE_WALL, load_robot(wall), closed)) == []
-
-
-def test_a_valid_line_is_the_only_path(wall):
-    (path,) = find_paths(*BESIDE_WALL, load_robot(wall), lambda q: q)
-    np.testing.assert_array_equal(path[[0, -1]], BESIDE_WALL)
-    np.testing.assert_allclose(np.diff(path, 2, axis=0), 0, atol=1e-12)
-
-
-def test_a_path_is_reproducible(wall):
-    gate = until(lambda q: (np.abs(q[0]) < 0.1) & (q[1] < 0.5))
-    paths = [
-        find_path(*BESIDE_WALL, load_robot(wall), gate, seed=seed) for seed in (0, 0, 1)
-    ]
-    assert np.array_equal(paths[0], paths[1])
-    assert not np.array_equal(paths[0], paths[2])
 
 
 def test_a_motion_along_a_path_meets_the_boundary_conditions(wall):

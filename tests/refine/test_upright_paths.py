@@ -10,16 +10,10 @@ import pytest
 import cnpgen
 from cnpgen.plans.plans import Plans
 from cnpgen.problems.problem_record import open_problem
-from cnpgen.refine import attempts
+from cnpgen.refine import attempts, rrt_connect
 from cnpgen.refine.options import DEFAULT_OPTIONS
 from cnpgen.refine.refine_engine import prepare, tasks_of
-from cnpgen.refine.rrt_connect import (
-    MAX_STATE_SPACING,
-    STATE_SPACING,
-    RestSpace,
-    find_paths,
-    follow_line,
-)
+from cnpgen.refine.rrt_connect import MANIFOLD_SPACING_RAD, TreeSearch
 from cnpgen.refine.task import Outcome
 from cnpgen.world.world import World
 from tests.conftest import needs_compiler
@@ -38,9 +32,9 @@ def transport(label: str) -> Plans:
     return cnpgen.complete("heavy-object", **ENDS[label]).plans
 
 
-def space_of(problems: Plans) -> RestSpace:
+def search_of(problems: Plans) -> TreeSearch:
     tool, (task,) = prepare(problems, DEFAULT_OPTIONS), tasks_of(problems)
-    return tool.rest_space(task)
+    return tool.tree_search(task)
 
 
 def violations(problems: Plans, states: np.ndarray) -> Iterator[float]:
@@ -62,38 +56,17 @@ def violations(problems: Plans, states: np.ndarray) -> Iterator[float]:
 
 def test_a_path_holds_the_object_upright_and_within_all_limits() -> None:
     problems = transport("tilted on the way")
-    space, ends = (
-        space_of(problems),
-        (problems.boundary.start_q[0], problems.boundary.goal_q[0]),
-    )
-    assert not follow_line(*ends, space.follow)[1]
-    path = next(find_paths(*ends, space.robot, space.follow))
-    np.testing.assert_allclose(path[[0, -1]], ends, atol=1e-6)
-    assert np.abs(np.diff(path, axis=0)).max() <= MAX_STATE_SPACING
+    search = search_of(problems)
+    ends = problems.boundary.start_q[0], problems.boundary.goal_q[0]
+    assert search.line() is None
+    path, *others = search.paths()
+    assert 0 < len(others) < rrt_connect.MAX_CHECKED_PATHS
+    np.testing.assert_array_equal(path[[0, -1]], ends)
+    assert np.abs(np.diff(path, axis=0)).max() <= 3 * MANIFOLD_SPACING_RAD
     assert max(violations(problems, path)) <= 1
     assert (
         max(violations(problems, (path[1:] + path[:-1]) / 2)) <= MAX_MIDPOINT_VIOLATION
     )
-
-
-def test_states_off_the_equalities_are_projected_within_the_joint_limits() -> None:
-    problems = transport("joint on its limit")
-    space, start = space_of(problems), problems.boundary.goal_q
-    robot, random = space.robot, np.random.default_rng(0)
-    away = start.T + random.uniform(-STATE_SPACING, STATE_SPACING, (robot.n, 20))
-    projected = space.projected(away)
-    assert (projected >= robot.position_lower[:, None]).all()
-    assert (projected <= robot.position_upper[:, None]).all()
-    assert np.abs(projected - away).max() < 10 * STATE_SPACING
-    problem, _ = open_problem(problems.problem)
-    world = World(robot, problem.obstacle, problem.object_size)
-    (vertical,) = (item for item in problem.constraint if item.reason == "not vertical")
-    for q in projected.T:
-        world.set_state(q, 0 * q, 0 * q, space.scene_poses)
-        assert all(
-            condition.violation() < 0.1 * vertical.tolerance
-            for condition in vertical.measured(world)
-        )
 
 
 @pytest.mark.parametrize("label", UNSOLVED)

@@ -199,7 +199,7 @@ class CollisionChecker:
             parts["link"][index] = links[part.link]
             blocks.append(hull.values)
             first += len(hull.values)
-        self.vertices = np.concatenate(blocks)
+        self.vertices = np.concatenate([*blocks, np.empty(0)])
         self._set("parts", parts)
         return parts
 
@@ -222,7 +222,7 @@ class CollisionChecker:
             np.flatnonzero(parts["link"] == link) for link in range(len(capsules))
         ]
         self._set("first_part", np.append(0, np.cumsum(list(map(len, of_link)))))
-        self._set("part_of_link", np.concatenate(of_link))
+        self._set("part_of_link", np.concatenate([*of_link, np.empty(0, np.intp)]))
         self._scene.n_links = len(capsules)
         return of_link
 

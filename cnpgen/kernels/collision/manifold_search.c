@@ -2,7 +2,7 @@
 (CBiRRT, Berenson et al. 2009); tree_search.c precedes this file. All states of an edge are nodes, since the straight line between
 two distant states leaves the manifold. */
 
-enum { BLOCK = 16, MAX_EQUALITIES = 64, MAX_PROJECTIONS = 5 }; /* states that are projected at once; rows; steps */
+enum { MAX_EQUALITIES = 64, MAX_PROJECTIONS = 5 }; /* rows; steps */
 #define MAX_STRETCH 3.0      /* of the spacing, between projected states */
 #define MAX_STEP 0.5         /* of a joint [rad or m] */
 #define RELATIVE_DAMPING 1e-6
@@ -101,7 +101,7 @@ static long follow(search *h, manifold *m, tree *t, long node, const double *tar
     for (long k = 0; k < block; k++)
       for (long j = 0; j < n; j++)
         m->q[j * BLOCK + k] = from[j] + (target[j] - from[j]) * (share * (first + k) / count);
-    long met = project(s, m, block);
+    long met = project(s, m, block), resting = count_at_rest(s, m->q, met);
     for (long k = 0; k < block; k++) {
       for (long j = 0; j < n; j++) h->q[j] = m->q[j * BLOCK + k];
       int valid = length == INFINITY && first + k == count;
@@ -109,7 +109,7 @@ static long follow(search *h, manifold *m, tree *t, long node, const double *tar
          not checked. */
       int jumps = largest_difference(h->q, before, n) > MAX_STRETCH * s->spacing;
       if (k >= met || (jumps && !(is_root && last < 0))) return last;
-      if (!valid && !state_is_clear(h, h->q)) return last;
+      if (!valid && (k >= resting || !state_is_clear(h, h->q))) return last;
       memcpy(before, h->q, n * sizeof(double));
       if ((last = add_node(t, h->q, last < 0 ? node : last)) < 0) return -1;
     }
@@ -148,7 +148,7 @@ long find_manifold_path(const tree_settings *s, kernel *residuals, const double 
                         double *path, long max_points) {
   long n = s->scene->n, count = 0;
   if (rows > MAX_EQUALITIES) return 0;
-  search h = {s, make_memory(s->scene), s->seed * 0x9E3779B97F4A7C15ull + 88172645463325252ull, malloc(n * sizeof(double))};
+  search h = make_search(s);
   double *numbers = malloc(BLOCK * (n + rows + rows * n) * sizeof(double)), *target = malloc(n * sizeof(double));
   manifold m = {residuals, scene, rows, accuracy, numbers, numbers + BLOCK * n, numbers + BLOCK * (n + rows)};
   tree trees[2] = {make_tree(n), make_tree(n)};

@@ -1,8 +1,11 @@
 /* Joint-space paths among obstacles by RRT-Connect (Kuffner and LaValle 2000); collision.c precedes this file.
 
 Edges are checked as a whole, in bisection order, so that collisions show early. The required distances grow by a margin away
-from all ends, where the clearance may be smaller. Of several goals every one is a root of the second tree. Paths are shortened by straight lines between random points if that reduces
-their estimated duration. */
+from all ends, where the clearance may be smaller. Conditions of a robot at rest other than distances of hulls, such as those of
+capsules, are bounds of a kernel that evaluates BLOCK states at once. Of several goals every one is a root of the second tree.
+Paths are shortened by straight lines between random points if that reduces their estimated duration. */
+
+enum { BLOCK = 16 }; /* states that a kernel evaluates at once */
 
 typedef struct {
   const robot_scene *scene;
@@ -13,6 +16,12 @@ typedef struct {
   double corner_time;                                    /* that a corner costs [s] */
   unsigned long long seed;
   long goals; /* rows of `goal` */
+  /* Kernel (w, scene) -> g of BLOCK states at rest, w begins with q; the bounds of g, and memory for it. Null for no kernel. */
+  kernel *at_rest;
+  double *rest_w;
+  const double *rest_scene, *rest_lower, *rest_upper;
+  double *rest_g;
+  long rest_rows;
 } tree_settings;
 
 typedef struct {
@@ -26,8 +35,14 @@ typedef struct {
   const tree_settings *s;
   memory *m;
   unsigned long long random;
-  double *q;
+  double *q, *block; /* one state, and BLOCK states as columns, (n, BLOCK) */
 } search;
+
+static search make_search(const tree_settings *s) {
+  double *states = malloc((1 + BLOCK) * s->scene->n * sizeof(double));
+  unsigned long long random = s->seed * 0x9E3779B97F4A7C15ull + 88172645463325252ull;
+  return (search){s, make_memory(s->scene), random, states, states ? states + s->scene->n : NULL};
+}
 
 static double uniform(search *h) {
   /* xorshift64 (Marsaglia 2003); 53 bits make a number in [0, 1). */
@@ -57,18 +72,50 @@ static int state_is_clear(search *h, const double *q) {
   return is_clear(s->scene, h->m, q, s->obstacle_distance + margin, s->self_distance + margin);
 }
 
-/* Whether a straight line is clear, except for its first state and, if it is an end of the path, its last one. */
-static int line_is_clear(search *h, const double *a, const double *b, int check_last) {
-  long n = h->s->scene->n, count = (long)ceil(largest_difference(a, b, n) / h->s->spacing), step = 1;
-  if (check_last && !state_is_clear(h, b)) return 0;
+/* Return the number of leading ones of `count` states, q (n, BLOCK), that meet the conditions of a robot at rest. */
+static long count_at_rest(const tree_settings *s, const double *q, long count) {
+  const long strides[2] = {BLOCK, BLOCK};
+  long leading = count;
+  if (!s->at_rest || !count) return count;
+  memcpy(s->rest_w, q, s->scene->n * BLOCK * sizeof(double));
+  s->at_rest(count, (const double *const[]){s->rest_w, s->rest_scene}, strides, (double *const[]){s->rest_g});
+  for (long i = 0; i < s->rest_rows; i++)
+    for (long k = 0; k < leading; k++) {
+      double g = s->rest_g[i * count + k];
+      /* A comparison with nan is false, so that a state with one is invalid; the loop ends with k = leading. */
+      if (!(g >= s->rest_lower[i] && g <= s->rest_upper[i])) leading = k;
+    }
+  return leading;
+}
+
+static void put_state(search *h, long k, const double *q) {
+  for (long j = 0; j < h->s->scene->n; j++) h->block[j * BLOCK + k] = q[j];
+}
+
+/* Whether the first `count` states of the block are valid. */
+static int block_is_valid(search *h, long count) {
+  if (count_at_rest(h->s, h->block, count) < count) return 0;
+  for (long k = 0; k < count; k++) {
+    for (long j = 0; j < h->s->scene->n; j++) h->q[j] = h->block[j * BLOCK + k];
+    if (!state_is_clear(h, h->q)) return 0;
+  }
+  return 1;
+}
+
+/* Whether a straight line is valid, except for its first state and, if it is an end of the path, its last one. */
+static int line_is_valid(search *h, const double *a, const double *b, int check_last) {
+  long n = h->s->scene->n, count = (long)ceil(largest_difference(a, b, n) / h->s->spacing), step = 1, filled = 0;
+  if (check_last) put_state(h, filled++, b);
   /* Van der Corput order: the middle first, then the quarters. An edge in collision is often in collision there. */
   while (2 * step < count) step *= 2;
   for (long stride = step; stride >= 1; stride /= 2)
     for (long k = stride; k < count; k += 2 * stride) {
-      for (long j = 0; j < n; j++) h->q[j] = a[j] + (b[j] - a[j]) * k / count;
-      if (!state_is_clear(h, h->q)) return 0;
+      for (long j = 0; j < n; j++) h->block[j * BLOCK + filled] = a[j] + (b[j] - a[j]) * k / count;
+      if (++filled < BLOCK) continue;
+      if (!block_is_valid(h, filled)) return 0;
+      filled = 0;
     }
-  return 1;
+  return block_is_valid(h, filled);
 }
 
 static tree make_tree(long n) {
@@ -113,7 +160,7 @@ static long extend(search *h, tree *t, long node, const double *target, double *
   *reached = distance <= h->s->extension;
   for (long j = 0; j < t->n; j++)
     fresh[j] = *reached ? target[j] : from[j] + (target[j] - from[j]) * (h->s->extension / distance);
-  return line_is_clear(h, from, fresh, 1) ? add_node(t, fresh, node) : -1;
+  return line_is_valid(h, from, fresh, 1) ? add_node(t, fresh, node) : -1;
 }
 
 /* Add the start and the goals as roots of two trees. */
@@ -167,8 +214,9 @@ static long shorten(search *h, double *path, long count, double *copy, long max_
     section = along[1] - along[0] + (index[1] - index[0]) * s->corner_time;
     /* A shortcut costs its line and the two corners that it makes. */
     double straight = line_time(s, ends, ends + n) + 2 * s->corner_time;
-    if (straight >= section || !line_is_clear(h, ends, ends + n, 1)) continue;
-    if (!state_is_clear(h, ends)) continue;
+    if (straight >= section || !line_is_valid(h, ends, ends + n, 1)) continue;
+    put_state(h, 0, ends);
+    if (!block_is_valid(h, 1)) continue;
     long kept = index[0] + 1;
     memcpy(copy, path, kept * n * sizeof(double));
     memcpy(copy + n * kept, ends, 2 * n * sizeof(double)), kept += 2;
@@ -181,7 +229,7 @@ static long shorten(search *h, double *path, long count, double *copy, long max_
   for (long i = 1; i + 1 < count;) { /* remove points that are not needed */
     double around = line_time(s, path + n * (i - 1), path + n * i) + line_time(s, path + n * i, path + n * (i + 1));
     double straight = line_time(s, path + n * (i - 1), path + n * (i + 1));
-    if (straight < around + s->corner_time && line_is_clear(h, path + n * (i - 1), path + n * (i + 1), 0)) {
+    if (straight < around + s->corner_time && line_is_valid(h, path + n * (i - 1), path + n * (i + 1), 0)) {
       memmove(path + n * i, path + n * (i + 1), (count - i - 1) * n * sizeof(double));
       count--;
       i = i > 1 ? i - 1 : 1;
@@ -191,14 +239,14 @@ static long shorten(search *h, double *path, long count, double *copy, long max_
   return count;
 }
 
-/* Return the index of the fastest clear straight line from the start to a goal, or -1. */
+/* Return the index of the fastest valid straight line from the start to a goal, or -1. */
 static long fastest_line(search *h) {
   const tree_settings *s = h->s;
   long n = s->scene->n, fastest = -1;
   double least = INFINITY;
   for (long g = 0; g < s->goals; g++) {
     double duration = line_time(s, s->start, s->goal + n * g);
-    if (duration < least && line_is_clear(h, s->start, s->goal + n * g, 0)) least = duration, fastest = g;
+    if (duration < least && line_is_valid(h, s->start, s->goal + n * g, 0)) least = duration, fastest = g;
   }
   return fastest;
 }
@@ -207,7 +255,7 @@ static long fastest_line(search *h) {
 OUT_OF_MEMORY. */
 long find_path(const tree_settings *s, double *path, long max_points) {
   long n = s->scene->n, count = 0;
-  search h = {s, make_memory(s->scene), s->seed * 0x9E3779B97F4A7C15ull + 88172645463325252ull, malloc(n * sizeof(double))};
+  search h = make_search(s);
   double *target = malloc(n * sizeof(double)), *fresh = malloc(n * sizeof(double));
   tree trees[2] = {make_tree(n), make_tree(n)};
   add_roots(trees, s);

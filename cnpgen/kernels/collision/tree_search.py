@@ -1,4 +1,8 @@
-"""Joint-space paths among obstacles by RRT-Connect in compiled code (Kuffner and LaValle 2000)."""
+"""Joint-space paths among obstacles by RRT-Connect in compiled code (Kuffner and LaValle 2000).
+
+Where there are equalities, the states of an edge are first projected onto the manifold
+by Gauss-Newton steps within the joint limits (CBiRRT, Berenson et al. 2009).
+"""
 
 import ctypes
 from ctypes import c_double, c_long, c_ulonglong, c_void_p
@@ -12,7 +16,7 @@ from cnpgen.kernels.compiled_kernel import address_of, require_memory
 from cnpgen.kernels.kernel import Kernel
 
 MAX_PATH_POINTS = 2000
-STATES_PER_PROJECTION = 16  # BLOCK in manifold_search.c
+STATES_PER_CALL = 16  # BLOCK in tree_search.c
 MAX_PROJECTION_ERROR = 1e-4  # of residuals [rad or m]
 CORNER_TIME_S = 0.12  # of a corner of a path, added to the time at the velocity limits
 
@@ -32,6 +36,11 @@ class _TreeSettings(ctypes.Structure):
         *((name, c_double) for name in ("spacing", "extension")),
         *((name, c_long) for name in ("max_extensions", "max_nodes", "shortcuts")),
         *(("corner_time", c_double), ("seed", c_ulonglong), ("goals", c_long)),
+        *(
+            (name, c_void_p)
+            for name in ("at_rest", "w", "rest_scene", "rest_lower", "rest_upper", "g")
+        ),
+        ("rest_rows", c_long),
     )
 
 
@@ -79,6 +88,35 @@ class EqualityKernel:
     scene: Array
 
 
+@dataclass(frozen=True)
+class RestConditions:
+    """Conditions of a robot at rest that every state of a path meets, beside distances of hulls.
+
+    Attributes:
+        residuals: Kernel ``(w, scene) -> g``, where w begins with q.
+        w: Values of w at rest, of which q is replaced, shape (width,).
+        scene: Values of the scene that it takes, shape (width,).
+        lower: Bounds of g, shape (m,), each infinite where it does not hold.
+        upper: In the same way.
+    """
+
+    residuals: Kernel
+    w: Array
+    scene: Array
+    lower: Array
+    upper: Array
+
+    def arrays(self) -> list[Array]:
+        """Return the arrays of ``tree_settings``: arguments for every lane, bounds, and memory for g."""
+        lanes = (np.repeat(x, STATES_PER_CALL) for x in (self.w, self.scene))
+        return [
+            *lanes,
+            self.lower,
+            self.upper,
+            np.empty((len(self.lower), STATES_PER_CALL)),
+        ]
+
+
 def find_tree_path(
     checker: CollisionChecker,
     ends: tuple[Array, Array],
@@ -88,8 +126,9 @@ def find_tree_path(
     *,
     seed: int,
     manifold: EqualityKernel | None = None,
+    at_rest: RestConditions | None = None,
 ) -> Array | None:
-    """Search for a path whose straight lines are clear; it is shortened by its estimated duration.
+    """Search for a path whose straight lines are valid; it is shortened by its estimated duration.
 
     Of several goals, shape (G, n), all are roots of one tree: the path ends in any of them.
     On a manifold the path consists of projected states at small distances, and fewer of
@@ -107,6 +146,12 @@ def find_tree_path(
     ]
     # Without a check the required distance is -inf, which every distance exceeds.
     numbers = [-np.inf if value is None else value for value in astuple(settings)]
+    memory = [] if at_rest is None else at_rest.arrays()
+    kernel = (
+        ()
+        if at_rest is None
+        else (at_rest.residuals.address, *map(address_of, memory), len(at_rest.lower))
+    )
     native = _TreeSettings(
         checker.address,
         *map(address_of, arrays),
@@ -114,6 +159,7 @@ def find_tree_path(
         CORNER_TIME_S,
         seed + 1,
         arrays[1].size // len(arrays[0]),
+        *kernel,
     )
     path = np.empty((MAX_PATH_POINTS, len(arrays[0])))
     count = _search(checker, native, manifold, path)
@@ -137,7 +183,7 @@ def _search(
         # The kernel projects a block of states at once, so the scene is repeated for
         # each lane.
         search = checker.library.find_manifold_path
-        scene = np.repeat(manifold.scene, STATES_PER_PROJECTION)
+        scene = np.repeat(manifold.scene, STATES_PER_CALL)
         search.restype = c_long
         search.argtypes = (*(c_void_p,) * 3, c_long, c_double, c_void_p, c_long)
         search.errcheck = require_memory

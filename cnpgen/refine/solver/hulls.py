@@ -22,7 +22,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from cnpgen.arrays import Array, Mask
+from cnpgen.arrays import Array
 from cnpgen.kernels.collision.collision_checker import MAX_JOINTS, CollisionChecker
 from cnpgen.kernels.collision.row_kernels import DistanceColumns, RowKernels
 from cnpgen.kernels.kernel import Kernel
@@ -165,16 +165,6 @@ class Hulls:
         for k, column, distance in self._close(q, obstacle_poses):
             np.minimum.at(distances, (k, column), distance)
         return distances
-
-    def clear_states(
-        self, q: Array, obstacle_poses: Array, *, links_only: bool = False
-    ) -> Mask:
-        """Return a mask of the states q (n, K) with the required distances, of links from each other only or of all."""
-        return self.placed_checker(obstacle_poses).clear_states(
-            q,
-            obstacle_distance=None if links_only else self.obstacle_distance,
-            self_distance=self.self_distance,
-        )
 
     def violation(
         self, q: Array, obstacle_poses: Array, *, above_tolerance: bool = False

@@ -7,8 +7,8 @@ is time. The goal is a position of the tip, as in the paper. If no state reaches
 goal, the nearest state is the result. Random torques would exceed a velocity limit
 within 5 ms.
 
-The trees of ``refine/rrt_connect.py`` have configurations and parents only, so the two
-share no code.
+The compiled trees of ``refine/rrt_connect.py`` have configurations and parents only, so
+the two share no code.
 """
 
 from collections.abc import Callable
