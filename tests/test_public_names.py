@@ -22,7 +22,7 @@ from cnpgen.schema.public_names import NAMES
 
 SPECIAL = {"__init__", "__call__", "__getitem__", "__iter__"}
 INNER = {  # classes in public signatures that users neither construct nor annotate
-    "LimitSource": "basis and source of a limit, returned by evaluations",
+    "JudgedLimits": "limits that an evaluation applied, with who states them",
     "SceneColumns": "places in the values of a scene, returned by Problem.scene_columns",
     "Columns": "layout of a Batch, used through the names of its fields",
     "BatchPartition": "constructed by Dataset.batches",

@@ -38,7 +38,6 @@ _TALLIES = {
 def summary_text(file: Path, found: "Evaluation") -> str:
     """Format the summary of all plans."""
     from cnpgen.judges.plans.sampling import MAX_TIME_SAMPLES
-    from cnpgen.problems.limit_sources import sources_line
 
     summary = found.summary()
     count = len(found.verdicts)
@@ -55,10 +54,9 @@ def summary_text(file: Path, found: "Evaluation") -> str:
         (text, f"{number:,} of {count:,}", f"{share:.2%}", "")
         for text, (number, share) in counts.items()
     ]
-    torque = f"torque: {found.judged_torque}" if found.judged_torque else ""
-    notes = filter(None, [torque, sources_line(found.limit_sources)])
     rows = table(tallies, indent="  ", right=(1, 2))
-    sections = [[head, checksum_text(found.plans), *notes, "", *rows]]
+    limits = found.judged_limits.lines
+    sections = [[head, checksum_text(found.plans), *limits, "", *rows]]
     tables = (
         (_reasons(found, summary), (1,)),
         (_figures(summary, _shown(found)), range(1, 7)),

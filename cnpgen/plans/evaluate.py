@@ -20,8 +20,7 @@ from cnpgen.machine.workers import distribute, worker_count
 from cnpgen.plans.format import PlanStatus
 from cnpgen.plans.plans import Plans
 from cnpgen.plans.tips import correct_tips
-from cnpgen.problems.constraints.joint import judged_torque
-from cnpgen.problems.limit_sources import LimitSource, judged_sources
+from cnpgen.problems.limit_sources import JudgedLimits
 from cnpgen.problems.problem_record import open_problem
 from cnpgen.schema.argument_types import checked_arguments
 from cnpgen.schema.arguments import number, numbers
@@ -93,15 +92,9 @@ class Evaluation:
         )
 
     @cached_property
-    def judged_torque(self) -> str:
-        """Torque that was judged, in words: "rigid body", or with drives; empty if the problem limits none."""
-        problem, robot = open_problem(self.plans.problem)
-        return judged_torque(problem.constraint, robot)
-
-    @cached_property
-    def limit_sources(self) -> dict[str, LimitSource]:
-        """Who states the limits that were judged: quantity -> source."""
-        return judged_sources(*open_problem(self.plans.problem))
+    def judged_limits(self) -> JudgedLimits:
+        """Limits that were judged, with who states them."""
+        return JudgedLimits.of(*open_problem(self.plans.problem))
 
     def summary(self) -> JsonObject:
         """Return the summary of all plans for JSON ('cnpgen docs verdict')."""
@@ -112,10 +105,7 @@ class Evaluation:
             "problem": record.name,
             "problem_sha256": record.comparable_sha256,
             "checksum": self.plans.checksum,
-            **({"torque": self.judged_torque} if self.judged_torque else {}),
-            "limit_sources": {
-                name: source.to_dict() for name, source in self.limit_sources.items()
-            },
+            **self.judged_limits.to_dict(),
             "step_s": self.step,
             **(
                 {"tracking_error_rad": list(self.tracking_error)}

@@ -5,13 +5,9 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 
-from cnpgen.problems.constraints.joint import (
-    JointAcceleration,
-    JointJerk,
-    JointPosition,
-    JointTorque,
-    JointVelocity,
-)
+from cnpgen.documents import JsonObject
+from cnpgen.problems.constraints.joint import judged_torque
+from cnpgen.problems.idle_keys import idle_keys, idle_text
 from cnpgen.problems.load_robot import JERK_RATE
 from cnpgen.problems.problem import Problem
 from cnpgen.robots.robot import Robot
@@ -26,15 +22,6 @@ WORDS = {  # basis -> what a limit is called
     "stated": "of another source",
     "guess": "guessed",
     NOT_STATED: NOT_STATED,
-}
-# Quantity -> constraint that its limit is for, in the order of output.
-_JUDGED_BY = {
-    "position": JointPosition,
-    "velocity": JointVelocity,
-    "acceleration": JointAcceleration,
-    "jerk": JointJerk,
-    "torque": JointTorque,
-    "motor": JointTorque,
 }
 
 
@@ -93,12 +80,51 @@ def limit_sources(problem: Problem, robot: Robot) -> dict[str, LimitSource]:
 
 def judged_sources(problem: Problem, robot: Robot) -> dict[str, LimitSource]:
     """Return the sources of the limits that constraints of a problem apply: quantity -> source."""
-    kinds = {type(constraint) for constraint in problem.constraint}
+    judged = {key for each in problem.constraint for key in each.reads or ()}
     return {
         name: source
         for name, source in limit_sources(problem, robot).items()
-        if _JUDGED_BY[name] in kinds
+        if f"limits.sources.{name}" in judged
     }
+
+
+@dataclass(frozen=True)
+class JudgedLimits:
+    """Limits that a verdict applies.
+
+    Attributes:
+        torque: Torque that is judged, in words; empty if the problem limits none.
+        sources: Who states the limits: quantity -> source.
+        idle: Result of ``idle_keys``.
+    """
+
+    torque: str
+    sources: Mapping[str, LimitSource]
+    idle: Mapping[str, str]
+
+    @classmethod
+    def of(cls, problem: Problem, robot: Robot) -> JudgedLimits:
+        """Return the limits of a problem and its robot."""
+        torque = judged_torque(problem.constraint, robot)
+        return cls(torque, judged_sources(problem, robot), idle_keys(problem))
+
+    def to_dict(self) -> JsonObject:
+        """Return the limits for JSON."""
+        return {
+            **({"torque": self.torque} if self.torque else {}),
+            "limit_sources": {
+                name: source.to_dict() for name, source in self.sources.items()
+            },
+            "idle_keys": dict(self.idle),
+        }
+
+    @property
+    def lines(self) -> list[str]:
+        """Lines of text, without empty ones."""
+        torque = f"torque: {self.torque}" if self.torque else ""
+        return list(
+            filter(None, [torque, sources_line(self.sources), idle_text(self.idle)])
+        )
 
 
 def sources_line(sources: Mapping[str, LimitSource]) -> str:

@@ -1,5 +1,6 @@
 """Problem files, loaded by name or path, and problems restored from records."""
 
+import logging
 import os
 import warnings
 from collections.abc import Iterator
@@ -16,6 +17,7 @@ from cnpgen.errors import PluginError, RecipeError
 from cnpgen.problems.checks import ProblemTables, limit_errors, problem_errors, tables
 from cnpgen.problems.constraints.constraint import Constraint
 from cnpgen.problems.constraints.joint import JointTorque
+from cnpgen.problems.idle_keys import idle_keys, idle_text
 from cnpgen.problems.objectives import ObjectiveTerm
 from cnpgen.problems.problem import FILES, Problem
 from cnpgen.problems.urdf_dynamics import undecided_friction
@@ -29,6 +31,8 @@ from cnpgen.schema.keys import RecipeLocation
 from cnpgen.schema.parsing import Reader, parse, stored_values
 from cnpgen.schema.toml import Kind, read_table
 from cnpgen.schema.units import show
+
+_LOG = logging.getLogger(__name__)
 
 
 @checked_arguments
@@ -117,15 +121,16 @@ def read_problem(path: Path, errors: list[str]) -> Problem | None:
                 UserWarning,
                 stacklevel=3,
             )
-    spec = replace(problem.robot, geometry=raw.geometry)
-    constraints = raw.with_object_clearance(problem)
-    return replace(
+    read = replace(
         problem,
         path=path.absolute(),
-        robot=spec,
+        robot=replace(problem.robot, geometry=raw.geometry),
         obstacle=obstacles,
-        constraint=constraints,
+        constraint=raw.with_object_clearance(problem),
     )
+    if text := idle_text(idle_keys(read)):
+        _LOG.warning("%s: %s", path, text)
+    return read
 
 
 def _with_meshes(

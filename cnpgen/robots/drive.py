@@ -15,7 +15,7 @@ from cnpgen.arrays import Array
 from cnpgen.documents import NamedErrors
 from cnpgen.errors import counted
 from cnpgen.robots.parameter_ranges import optional_key
-from cnpgen.schema.keys import PerJoint, field
+from cnpgen.schema.keys import PerJoint, field, keys
 
 MIN_REVERSAL_SPEED = 0.01  # rad/s; the verdict resolves reversals of 1 ms
 
@@ -109,8 +109,7 @@ class DriveSpec:
                 "armature",
                 "is also given by 'rotor_inertia' and 'gear_ratio', expected one of them",
             )
-        has_friction = self.viscous or self.coulomb or self.urdf_dynamics == "use"
-        if self.friction_help and not has_friction:
+        if self.friction_help and not self.has_friction:
             yield (
                 "friction_help",
                 "there is no friction: give 'viscous' or 'coulomb', or urdf_dynamics = \"use\"",
@@ -118,6 +117,27 @@ class DriveSpec:
         for key in ("power", "line"):
             if self.limits == "joint" and getattr(self, key):
                 yield key, "limits motors, but 'limits' is \"joint\""
+
+    @property
+    def has_friction(self) -> bool:
+        """Whether friction is stated, or taken from the URDF."""
+        return bool(self.viscous or self.coulomb or self.urdf_dynamics == "use")
+
+    @property
+    def idle_keys(self) -> dict[str, str]:
+        """Stated keys, as "drive.armature", without effect on limits of torques: key -> what they need."""
+        if self.limits == "joint":
+            names = (key.name for key in keys(type(self)) if key.name != "limits")
+            return {f"drive.{name}": "limit of motors" for name in names}
+        # The limit of the motors takes the place of that of the joints.
+        idle = (
+            {"limits.torque": "limit of joints"}
+            if self.limits == "motor" and self.torque
+            else {}
+        )
+        return (
+            idle if self.has_friction else idle | {"drive.reversal_speed": "friction"}
+        )
 
 
 NO_DRIVE = DriveSpec()

@@ -119,7 +119,8 @@ def _with_torque(problem: Problem, robot: Robot) -> tuple[Problem, Names]:
     # Torques of links without masses are meaningless.
     if not robot.chain.joints[-1].mass > 0:
         text = "no mass that the last joint moves: its torques would be wrong, so 'joint-torque' is omitted"
-        return problem, (text,)
+        limits = replace(problem.limits, torque_scale=LimitSpec.torque_scale)
+        return replace(problem, limits=limits), (text,)
     # After the limits of joint positions and their derivatives.
     limit = JointTorque(tolerance=5e-3, budget=6e-2)
     constraints = (*problem.constraint[:4], limit, *problem.constraint[4:])

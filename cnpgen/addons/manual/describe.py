@@ -1,7 +1,7 @@
 """Output of ``cnpgen show``: recipes in words and numbers."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from textwrap import wrap
 from typing import Any
 
@@ -15,6 +15,7 @@ from cnpgen.pipelines.stages.stage import Stage
 from cnpgen.planner.model import Model
 from cnpgen.problems.constraints.constraint import Constraint
 from cnpgen.problems.constraints.joint import judged_torque
+from cnpgen.problems.idle_keys import idle_keys, idle_text
 from cnpgen.problems.limit_sources import WORDS, limit_sources
 from cnpgen.problems.load_robot import load_robot
 from cnpgen.problems.problem import Problem, resolved
@@ -135,6 +136,7 @@ def describe_problem(problem: Problem) -> str:
             "",
             "  sources of the limits",
             *table(_source_rows(problem, robot), indent="    "),
+            *_wrapped(filter(None, [idle_text(idle_keys(problem))])),
             *_drive(problem, robot),
             *_shape(problem, robot),
             "",
@@ -159,7 +161,12 @@ def _drive(problem: Problem, robot: Robot) -> list[str]:
     if torque and frictions and problem.drive.urdf_dynamics == "ignore":
         text = ", ".join(map(str, frictions))
         notes.append(f"friction of the URDF that is not used: {text}")
-    return lines + [
+    return lines + _wrapped(notes)
+
+
+def _wrapped(notes: Iterable[str]) -> list[str]:
+    """Wrap notes as lines of a section."""
+    return [
         line
         for note in notes
         for line in wrap(
@@ -457,6 +464,7 @@ def recipe_to_dict(recipe: Recipe) -> JsonObject:
     content["limit_sources"] = {
         name: source.to_dict() for name, source in limit_sources(problem, robot).items()
     }
+    content["idle_keys"] = idle_keys(problem)
     if torque := judged_torque(problem.constraint, robot):
         content["torque"] = torque
     return content

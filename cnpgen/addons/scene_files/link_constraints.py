@@ -45,6 +45,7 @@ SMOOTHING = 1e-12  # of squares below a root, which has a derivative at 0 then
 class _LinkPoseConstraint(LinkConstraint):
     """Base class: conditions on the pose of a link that do not depend on obstacles."""
 
+    reads = ()
     uses_obstacles = False
     has_solver_margin = True
     link: str = field("link of the robot")

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
+from functools import cached_property, partial
 from pathlib import Path
 
 import numpy as np
@@ -37,8 +37,7 @@ from cnpgen.documents import JsonObject
 from cnpgen.errors import UsageError, counted
 from cnpgen.judges.plans.judge import check_step
 from cnpgen.plans.evaluate import MAX_VERDICT_STEP_S, judged_in_parts
-from cnpgen.problems.constraints.joint import judged_torque
-from cnpgen.problems.limit_sources import LimitSource, judged_sources
+from cnpgen.problems.limit_sources import JudgedLimits
 from cnpgen.problems.problem import Problem
 from cnpgen.problems.problem_record import ProblemRecord, open_problem
 from cnpgen.robots.scene import Scene
@@ -99,16 +98,10 @@ class TrajectoryEvaluation:
         """Whether each trajectory is proven to be valid, or a valid motion through it exists, shape (N,)."""
         return np.array([verdict.valid for verdict in self.verdicts], bool)
 
-    @property
-    def judged_torque(self) -> str:
-        """Torque that was judged, in words; empty if the problem limits none."""
-        problem, robot = open_problem(self.problem)
-        return judged_torque(problem.constraint, robot)
-
-    @property
-    def limit_sources(self) -> dict[str, LimitSource]:
-        """Who states the limits that were judged: quantity -> source."""
-        return judged_sources(*open_problem(self.problem))
+    @cached_property
+    def judged_limits(self) -> JudgedLimits:
+        """Limits that were judged, with who states them."""
+        return JudgedLimits.of(*open_problem(self.problem))
 
     def summary(self) -> JsonObject:
         """Return the summary of all trajectories for JSON ('cnpgen docs trajectories')."""
@@ -124,10 +117,7 @@ class TrajectoryEvaluation:
             "format_version": TRAJECTORY_EVALUATION_VERSION,
             "problem": self.problem.name,
             "problem_sha256": self.problem.comparable_sha256,
-            **({"torque": self.judged_torque} if self.judged_torque else {}),
-            "limit_sources": {
-                name: source.to_dict() for name, source in self.limit_sources.items()
-            },
+            **self.judged_limits.to_dict(),
             "step_s": self.step,
             "trajectories": len(self.verdicts),
             **self.counts,

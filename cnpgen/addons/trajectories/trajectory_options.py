@@ -191,14 +191,12 @@ def write_json(
 def summary_text(file: Path, found: "TrajectoryEvaluation") -> str:
     """Return the counts, and for every condition the decisions with the worst margin."""
     from cnpgen.addons.trajectories.contradicting_columns import CONTRADICTION
-    from cnpgen.problems.limit_sources import sources_line
 
     counts = ", ".join(
         f"{count:,} {statement}" for statement, count in found.statements.items()
     )
     lines = [f"{file}: trajectories of {found.problem.name}: {counts}"]
-    lines += [f"torque: {found.judged_torque}"] if found.judged_torque else []
-    lines += filter(None, [sources_line(found.limit_sources)])
+    lines += found.judged_limits.lines
     for source, count in found.assumed_errors.items():
         lines.append(f"assumed for {count:,}, at least that of the numbers: {source}")
     if found.assumed_errors:

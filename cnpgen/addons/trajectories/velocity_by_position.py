@@ -102,6 +102,7 @@ class VelocityByPosition(Constraint):
     """
 
     reason = "joint velocity limit at a position"
+    reads = ()
     slope: PerJoint = field(
         "square of velocities per distance", unit="rad/s^2", low=1e-6
     )

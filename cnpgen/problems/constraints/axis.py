@@ -38,6 +38,7 @@ class TipAxis(Constraint):
     the tolerances, so that the bounds are the same for all samples.
     """
 
+    reads = ()
     training_weight = 300.0
 
     @property

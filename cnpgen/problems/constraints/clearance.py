@@ -20,6 +20,13 @@ if TYPE_CHECKING:
 
 # Of links in a valid motion: the accuracy of distances, no tolerance for collisions.
 MAX_LINK_PENETRATION_M = 1e-4
+# Keys of the geometry of the links.
+LINK_KEYS = (
+    "robot.convex_parts",
+    "robot.decomposed",
+    "robot.visual_links",
+    "robot.skipped_meshes",
+)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -72,6 +79,7 @@ class RobotClearance(DistanceConstraint):
 
     reason = "robot in collision"
     condition_name = "robot clearance"
+    reads = (*LINK_KEYS, "payload.touch_links")
     bodies = "robot"
     training_weight = 3000.0
     radius: float | None = field(
@@ -217,6 +225,7 @@ class ObjectContact(DistanceConstraint):
 
     reason = "object in collision"
     condition_name = "object contact"
+    reads = ("object",)
     bodies = "object"
     training_weight, training_inset = 3e4, 5e-4  # the inset in m
     depth: float = field("depth of legal contact", unit="m", low=0.0, plausible=0.5)

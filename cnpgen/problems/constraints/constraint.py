@@ -134,6 +134,8 @@ class Constraint(ABC):
             [unit of the condition].
         has_solver_margin: Whether ``solved`` has a margin for states between grid
             points; otherwise solvers add one.
+        reads: Keys of the problem beside its own that ``measured`` depends on, such as
+            "limits.jerk"; by default any.
         uses_obstacles: Whether ``measured`` depends on obstacles; otherwise ``met``
             checks states of different scenes.
         scene_width: Number of values that it needs for each motion, see
@@ -147,6 +149,7 @@ class Constraint(ABC):
     boundary_reason: ClassVar[str] = ""
     kinks: ClassVar[tuple[float, ...]] = ()
     uses_jerk: ClassVar[bool] = False
+    reads: ClassVar[tuple[str, ...] | None] = None
     training_weight: ClassVar[float | None] = None
     training_factor: ClassVar[float] = 1.0
     training_inset: ClassVar[float] = 0.0

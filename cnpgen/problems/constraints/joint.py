@@ -11,8 +11,9 @@ import numpy as np
 
 from cnpgen.arrays import Array
 from cnpgen.problems.constraints.constraint import Condition, Conditions, Constraint
-from cnpgen.robots.drive import RIGID, Drive, SpeedLine
-from cnpgen.schema.keys import field
+from cnpgen.robots.drive import RIGID, Drive, DriveSpec, SpeedLine
+from cnpgen.robots.parameter_ranges import PAYLOAD_PARAMETERS
+from cnpgen.schema.keys import field, keys
 from cnpgen.store.joint_units import units_of_joints
 
 if TYPE_CHECKING:
@@ -74,6 +75,12 @@ class JointPosition(Constraint):
     """Constraint: joint positions are within their limits: ``lower <= q <= upper``."""
 
     reason = "joint position limit"
+    reads = (
+        "limits.position",
+        "limits.position_scale",
+        "limits.soft",
+        "limits.sources.position",
+    )
     training_weight = 4000.0
     training_factor = 0.999
     tolerance: float = field(
@@ -94,6 +101,12 @@ class JointVelocity(_RelativeLimit):
     """Constraint: joint velocities are within their limits: ``|dq| <= limit``."""
 
     reason = "joint velocity limit"
+    reads = (
+        "limits.velocity",
+        "limits.velocity_scale",
+        "limits.sources.velocity",
+        "parameters.velocity_factor",
+    )
     training_weight = 100.0
     training_factor = 0.99
     condition_name = "joint velocity"
@@ -108,6 +121,13 @@ class JointAcceleration(_RelativeLimit):
     """Constraint: joint accelerations are within their limits: ``|ddq| <= limit``."""
 
     reason = "joint acceleration limit"
+    reads = (
+        "limits.acceleration",
+        "limits.acceleration_rate",
+        "limits.acceleration_cap",
+        "limits.sources.acceleration",
+        "parameters.acceleration_factor",
+    )
     training_weight = 5.0
     training_factor = 0.985
     condition_name = "joint acceleration"
@@ -125,6 +145,7 @@ class JointJerk(_RelativeLimit):
     """
 
     reason = "joint jerk limit"
+    reads = "limits.jerk", "limits.sources.jerk"
     training_weight = 0.01
     training_factor = 0.97
     condition_name = "joint jerk"
@@ -143,6 +164,15 @@ class JointTorque(_RelativeLimit):
     """
 
     reason = "joint torque limit"
+    reads = (
+        "limits.torque",
+        "limits.torque_scale",
+        "limits.sources.torque",
+        "limits.sources.motor",
+        *(f"drive.{key.name}" for key in keys(DriveSpec)),
+        *(f"payload.{key}" for key in ("mass", "centre", "inertia", "size")),
+        *(f"parameters.{name}" for name in PAYLOAD_PARAMETERS),
+    )
     training_weight = 1.5
     training_factor = 0.97
     condition_name = "joint torque"
@@ -241,6 +271,7 @@ class TipSpeed(Constraint):
     """Constraint: tip speed within a limit, ``|v| <= limit``, stated for the square, a smooth function."""
 
     reason = "tip too fast"
+    reads = ()
     limit: float = field("maximum speed of the tip", unit="m/s", low=1e-6)
     tolerance: float = field(
         "additional speed that a valid motion may have",

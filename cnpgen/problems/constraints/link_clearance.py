@@ -8,6 +8,7 @@ import numpy as np
 
 from cnpgen.arrays import Array, Mask
 from cnpgen.problems.constraints.clearance import (
+    LINK_KEYS,
     MAX_LINK_PENETRATION_M,
     DistanceConstraint,
 )
@@ -56,6 +57,7 @@ class SelfClearance(LinkClearance):
 
     reason = "robot in collision with itself"
     condition_name = "self clearance"
+    reads = (*LINK_KEYS, "robot.srdf", "robot.ignored_pairs", "payload.touch_links")
     bodies = "self"
     distance: float = field(
         "minimum distance of links", unit="m", low=0.0, default=0.0, plausible=2.0
@@ -140,6 +142,7 @@ class ObjectClearance(LinkClearance):
 
     reason = "object in collision with the robot"
     condition_name = "object clearance"
+    reads = (*LINK_KEYS, "object", "object.touch_links")
     bodies = "held object"
     training_weight = 3000.0
     distance: float = field(

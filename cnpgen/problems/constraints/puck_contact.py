@@ -57,6 +57,7 @@ class PuckContact(Constraint):
 
     reason = "early contact with the puck"
     boundary_reason = "start touches the puck"
+    reads = ()
     training_weight = 3e6
     has_solver_margin = True
     scene_width = 4

@@ -69,6 +69,7 @@ class TipRegion:
 class TipManifold(Constraint):
     """Base class: the tip stays in a region that subclasses define."""
 
+    reads = ()
     training_weight = 1e4  # one weight for position and orientation of a pose
 
     inside_name: ClassVar[str]

@@ -18,6 +18,7 @@ from cnpgen.addons.manual.describe_keys import part_of
 from cnpgen.cli.main import main
 from cnpgen.make.recipe import load_dataset_recipe
 from cnpgen.problems.constraints.joint import JointJerk
+from cnpgen.problems.idle_keys import idle_keys
 from cnpgen.problems.limit_sources import limit_sources
 from cnpgen.problems.load_robot import load_robot
 from cnpgen.problems.problem import resolved
@@ -286,6 +287,7 @@ def test_jerks_are_limited_in_proportion_to_the_accelerations(crane):
     problem = load_problem(crane / "problem.toml")
     robot = load_robot(problem)
     assert JointJerk in map(type, problem.constraint)
+    assert idle_keys(problem) == {}
     np.testing.assert_allclose(
         robot.jerk_limit, INITIAL_JERK_RATE * robot.acceleration_limit, rtol=5e-3
     )
@@ -595,6 +597,7 @@ def test_without_masses_and_shapes_their_constraints_are_left_out(tmp_path):
         "JointAcceleration",
         "JointJerk",
     ]
+    assert idle_keys(problem) == {}
     text = (tmp_path / "light" / "problem.toml").read_text(encoding="utf-8")
     assert "'joint-torque' is left out" in text
     assert "'self-clearance' is left out" in text
