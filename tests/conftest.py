@@ -35,6 +35,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from syrupy.assertion import SnapshotAssertion
 
 from cnpgen.kernels.compiler import find_compiler
 from cnpgen.kernels.library import Backend, KernelLibrary, default_cache_folder
@@ -46,6 +47,7 @@ from cnpgen.pipelines.stages.stage import CandidateBatch
 from cnpgen.robots.robot import Robot
 from cnpgen.store.files.cache_folder import exclusive_lock, make_private_folder
 from cnpgen.store.layout import MANIFEST
+from tests import refusals
 from tests.examples.casadi_kernels import CasadiLibrary
 from tests.measure_costs import function_of, read_costly
 
@@ -304,3 +306,9 @@ def fresh_compiler() -> Iterator[None]:
     forget()
     yield
     forget()
+
+
+@pytest.fixture(autouse=True)
+def _wording(snapshot: SnapshotAssertion) -> None:
+    """Give ``is_refused`` the snapshots of the running test."""
+    refusals.RunningTest.texts = snapshot.use_extension(refusals.Wording)

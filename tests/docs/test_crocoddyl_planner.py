@@ -19,6 +19,7 @@ from cnpgen.addons.benchmark.planners.trajopt import (
 from cnpgen.errors import MachineError
 from cnpgen.problems.problem_record import open_problem
 from tests.addons.benchmark.test_baselines import one_of
+from tests.refusals import is_refused
 
 EXAMPLE = Path(__file__).parents[2] / "docs" / "examples" / "crocoddyl_planner.py"
 
@@ -42,16 +43,12 @@ def test_crocoddyl_with_another_pinocchio_is_refused_before_its_import(
     monkeypatch.setitem(sys.modules, "crocoddyl", ModuleType("crocoddyl"))
     monkeypatch.setattr("importlib.metadata.version", lambda _: "3.2.1")
     monkeypatch.setattr("pinocchio.__version__", "4.1.0")
-    with pytest.raises(
-        MachineError, match=r"Crocoddyl 3.2.1 needs Pinocchio 4.0, installed is 4.1.0"
-    ):
+    with is_refused(MachineError):
         example().load_crocoddyl()
     monkeypatch.setattr("pinocchio.__version__", "4.0.2")
     assert example().load_crocoddyl().__name__ == "crocoddyl"
     monkeypatch.setattr("importlib.metadata.version", lambda _: "3.3.0")
-    with pytest.raises(
-        MachineError, match=r"must be 3.2.\* with Pinocchio 4.0.\*, installed is 3.3.0"
-    ):
+    with is_refused(MachineError):
         example().load_crocoddyl()
 
 

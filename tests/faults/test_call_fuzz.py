@@ -3,6 +3,7 @@
 import inspect
 from contextlib import suppress
 from typing import Any
+from unittest.mock import ANY
 
 import numpy as np
 import pytest
@@ -15,6 +16,7 @@ from cnpgen.schema.argument_types import checked_arguments
 from cnpgen.schema.arguments import integer, numbers
 from tests.faults.call_fuzz import CallOutcome, fuzz_calls
 from tests.faults.valid_calls import EXCLUDED, ValidCall, valid_calls
+from tests.refusals import is_refused
 
 CALLS = 2500  # some seconds
 PUBLIC_MODULES = (cnpgen, losses, benchmark, recipes, scenes, trajectories)
@@ -104,7 +106,7 @@ def test_wrong_types_are_found_before_the_call_or_from_its_exception() -> None:
     assert half(np.int32(3), scale=np.float32(0.5)) == 0.75
     assert half(5, whole=np.True_, text=None) == 2
     for wrong in ({"n": "3"}, {"scale": [1.0]}, {"whole": 1}, {"text": 3}):
-        with pytest.raises(UsageError, match="must be") as caught:
+        with is_refused(UsageError, argument=ANY) as caught:
             half(**{"n": 3, **wrong})
         assert caught.value.argument == next(iter(wrong))
     with pytest.raises(
@@ -116,28 +118,20 @@ def test_wrong_types_are_found_before_the_call_or_from_its_exception() -> None:
 def test_masked_arrays_are_refused() -> None:
     masked = np.ma.masked_invalid([0.1, np.nan])
     for values in (masked, [masked, masked]):
-        with pytest.raises(
-            UsageError, match=r"q must not be a masked array: pass filled values"
-        ):
+        with is_refused(UsageError, argument="q"):
             numbers("q", values)
 
 
 def test_requests_that_exceed_the_memory_are_refused(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    with pytest.raises(
-        UsageError,
-        match=r"^n must be smaller: 1,000,000,000,000,000 needs at least .* GB of memory",
-    ):
+    with is_refused(UsageError, argument="n"):
         cnpgen.draw_boundary_problems("airhockey-hit", 10**15)
-    with pytest.raises(UsageError, match=r"^nodes must be smaller"):
+    with is_refused(UsageError, argument="nodes"):
         cnpgen.PlanLoss("airhockey", nodes=10**15)
     monkeypatch.setattr(arguments, "MIN_CHECKED_SIZE", 1000)
     monkeypatch.setattr(arguments, "available_bytes", lambda: 10**6)
-    with pytest.raises(
-        UsageError,
-        match=r"n must be smaller: 100,000 needs at least 0\.\d+ GB of memory, 0\.001 GB",
-    ):
+    with is_refused(UsageError, argument="n"):
         cnpgen.draw_boundary_problems("airhockey-hit", 100_000)
 
 
@@ -145,7 +139,7 @@ def test_an_error_of_a_whole_sentence_keeps_its_text_and_carries_the_argument() 
     error = UsageError("there is no plan 3", concerns="which")
     assert (str(error), error.argument) == ("there is no plan 3", "which")
     assert UsageError("choose another {out}", remedies={"out": None}).argument == "out"
-    with pytest.raises(UsageError, match=r"^n must be an integer, got '3'$"):
+    with is_refused(UsageError, argument="n"):
         integer("n", "3")
 
 

@@ -39,6 +39,7 @@ from tests.examples.plan_files import plans_of
 from tests.examples.plans import load as stored_plan
 from tests.examples.scene_files import REQUEST, ROBOMETRICS, SCENE
 from tests.examples.store import dataset  # noqa: F401 - a fixture
+from tests.refusals import is_refused
 
 
 @pytest.mark.parametrize("value", [[], {}, [1], {"a": 1}], ids=str)
@@ -48,7 +49,7 @@ def test_a_list_or_a_table_where_a_number_is_expected(
 ) -> None:
     task = shards(load_dataset_spec(dataset))[0]
     rewritten(dataset / task.sidecar, lambda record: record.update(seconds=value))
-    with pytest.raises(DatasetError, match="seconds must be a number, got"):
+    with is_refused(DatasetError):
         load_record(dataset, task)
 
 
@@ -162,7 +163,7 @@ def test_empty_states_in_a_scene_of_robometrics(tmp_path: Path) -> None:
 def test_numbers_written_as_texts_in_a_trajectory(tmp_path: Path) -> None:
     rows = [{"t": str(k), "q": [0.1 * k] * 6} for k in range(3)]
     (tmp_path / "rows.json").write_text(json.dumps(rows))
-    with pytest.raises(UsageError, match="row 0: t must be a number, got '0'"):
+    with is_refused(UsageError, argument="path"):
         load_trajectories(tmp_path / "rows.json", "airhockey")
 
 
@@ -191,5 +192,5 @@ def test_a_goal_region_without_a_size_and_an_orientation_that_is_a_number(
 def test_an_answer_in_a_row_of_results_without_its_ending(tmp_path: Path) -> None:
     results = open_results(tmp_path / "results.jsonl", {"steps": 10})
     results.append({"problem": 0, "answer": {"t": ["0,5"], "q": [[0.0]]}})
-    with pytest.raises(DatasetError, match="is damaged: line 2: "):
+    with is_refused(DatasetError):
         open_results(tmp_path / "results.jsonl", {"steps": 10})

@@ -3,6 +3,7 @@
 import json
 from collections.abc import Callable
 from dataclasses import replace
+from unittest.mock import ANY
 
 import numpy as np
 import pytest
@@ -11,6 +12,7 @@ from cnpgen.errors import UsageError
 from cnpgen.judges.plans import Reason, judge, summarize_verdicts
 from tests.conftest import some
 from tests.examples.plans import Plan, joined, load, perturbed
+from tests.refusals import is_refused
 
 
 def _with(plan: Plan, name: str, index: tuple[int, ...], value: float) -> Plan:
@@ -130,13 +132,11 @@ def test_invalid_inputs_do_not_change_the_other_verdicts(label):
     ],
 )
 def test_shapes_that_do_not_match_raise_a_usage_error(change):
-    with pytest.raises(UsageError, match=r"shape|control points|scene must have"):
+    with is_refused(UsageError, argument=ANY):
         change(load("hit")).judged()
 
 
 @pytest.mark.parametrize("step", [0.0, -1e-3, np.nan, np.inf, 0.0101, 5.0])
 def test_a_time_step_must_be_positive_and_short_enough(step):
-    with pytest.raises(
-        UsageError, match=r"time step must be above 0 and at most 0\.01 s, got"
-    ):
+    with is_refused(UsageError, argument="step"):
         load("hit").judged(step=step)

@@ -21,6 +21,7 @@ from cnpgen.kernels.compiler import find_compiler
 from cnpgen.store.files.cache_folder import exclusive_lock, make_private_folder
 from tests.conftest import HANGING, needs_compiler
 from tests.machine.test_workers import alive
+from tests.refusals import is_refused
 
 BROKEN = {
     "fails": ("CC", "/bin/false", "/bin/false does not run"),
@@ -112,7 +113,7 @@ def test_a_broken_compiler_is_an_error(source, tmp_path, monkeypatch, what):
     monkeypatch.setattr(compiler, "find_spec", lambda _: None)  # no ziglang
     with pytest.raises(MachineError, match=text):
         compile_source([source], tmp_path)
-    with pytest.raises(MachineError, match=f"answer is missing: .*{text}"):
+    with is_refused(MachineError):
         load_library((source,), tmp_path)
 
 
@@ -132,7 +133,7 @@ def test_a_compilation_that_hangs_is_announced_and_killed(
     monkeypatch.setattr(compiler, "NOTICE_AFTER_S", 0.3)
     with (
         caplog.at_level("INFO"),
-        pytest.raises(MachineError, match=r"took more than 1 s for answer\.c: set CC"),
+        is_refused(MachineError),
     ):
         compile_source([source], tmp_path)
     assert any("has taken 0.3 s for answer.c" in text for text in caplog.messages)

@@ -20,6 +20,7 @@ from cnpgen.kernels.tape import Axes, GridSpec, Loop, Tape, tape_from_function
 from tests.conftest import needs_compiler
 from tests.examples.casadi_kernels import MappedGridKernel
 from tests.kernels.test_kernels import BINARY, REFERENCE, SPECIAL, UNARY
+from tests.refusals import is_refused
 
 Array = np.ndarray
 BACKENDS = ["compiled", "numpy", "casadi"]
@@ -161,9 +162,7 @@ def test_arguments_and_results_of_a_wrong_shape_or_type_are_refused(
         "rows": lambda x: np.repeat(x, 2, axis=-1)[..., ::2],
     }
     arrays[index] = change[how](arrays[index])
-    with pytest.raises(
-        ValueError, match=f"kernel mixed: {what} must be float32 of shape"
-    ):
+    with is_refused(ValueError):
         kernel(*arrays[:4], out=arrays[4:])
 
 
@@ -172,9 +171,7 @@ def test_a_missing_argument_is_refused(mixed, cache_folder, backend):
     kernel = kernel_of(
         mixed, GRID, backend=backend, dtype="float64", folder=cache_folder
     )
-    with pytest.raises(
-        ValueError, match="expected 4 arguments and 2 results, got 3 and 1"
-    ):
+    with is_refused(ValueError):
         kernel(*arguments_of(2, 2, "float64")[:3], out=[np.zeros((3, 2, 2))])
 
 
@@ -197,7 +194,7 @@ def test_a_grid_that_does_not_match_the_function_is_refused(mixed, grid, message
 
 
 def test_a_tape_without_a_grid_makes_no_grid_kernel(mixed):
-    with pytest.raises(ValueError, match="kernel mixed: its tape has no grid"):
+    with is_refused(ValueError):
         InterpretedGridKernel(tape_from_function(mixed))
 
 

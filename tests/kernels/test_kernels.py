@@ -28,6 +28,7 @@ from cnpgen.kernels.library import KernelLibrary, choose_backend
 from cnpgen.kernels.tape import CODES, NAMES, Loop, Tape, tape_from_function
 from tests.conftest import Prepare, needs_compiler, some
 from tests.examples.casadi_kernels import MappedKernel
+from tests.refusals import is_refused
 
 Array = np.ndarray
 
@@ -275,7 +276,7 @@ def test_rows_of_arguments_may_have_any_stride(mixed, cache_folder, backend):
 def test_arguments_of_a_wrong_shape_or_type_are_refused(
     mixed, cache_folder, backend, arguments
 ):
-    with pytest.raises(ValueError, match="mixed"):
+    with is_refused(ValueError):
         kernel_of(mixed, backend, cache_folder)(*arguments)
 
 
@@ -296,7 +297,7 @@ def test_objects_other_than_arrays_are_refused_by_compiled_kernels(mixed, cache_
     alike = SimpleNamespace(
         shape=array.shape, dtype=array.dtype, strides=array.strides, size=array.size
     )
-    with pytest.raises(ValueError, match="mixed: arguments must be NumPy arrays"):
+    with is_refused(ValueError):
         kernel_of(mixed, "compiled", cache_folder)(alike, np.zeros((2, 4)))
 
 
@@ -487,16 +488,16 @@ def test_a_tape_with_any_damaged_byte_raises(root):
 
 def test_unsupported_operations_are_refused():
     x = ca.SX.sym("x")
-    with pytest.raises(ValueError, match="tangent: operation"):
+    with is_refused(ValueError):
         tape_from_function(ca.Function("tangent", [x], [ca.tan(x)]))
 
 
 def test_sparse_arguments_and_results_are_refused():
     x = ca.SX.sym("x", ca.Sparsity.lower(2))
-    with pytest.raises(ValueError, match="argument 0 is sparse"):
+    with is_refused(ValueError):
         tape_from_function(ca.Function("lower", [x], [x[0, 0]]))
     y = ca.SX.sym("y", 2)
-    with pytest.raises(ValueError, match="result 0 is sparse"):
+    with is_refused(ValueError):
         tape_from_function(ca.Function("diagonal", [y], [ca.diag(y)]))
 
 
@@ -687,7 +688,7 @@ def test_without_llvm_numpy_runs_after_one_warning(own_cache, broken_llvm):
 
 
 def test_without_llvm_the_compiled_backend_is_a_machine_error(own_cache, broken_llvm):
-    with pytest.raises(MachineError, match="LLVM cannot be loaded"):
+    with is_refused(MachineError):
         choose_backend("compiled")
 
 
@@ -695,7 +696,7 @@ def test_a_generator_of_wrong_code_is_detected(own_cache, monkeypatch):
     monkeypatch.setattr(
         library_module, "CompiledKernel", lambda _tape, _folder: lambda x: [x]
     )
-    with pytest.raises(MachineError, match="wrong code"):
+    with is_refused(MachineError):
         choose_backend("compiled")
 
 
@@ -724,10 +725,7 @@ def test_a_cached_tape_has_the_read_permissions_of_the_umask(tmp_path):
 
 
 def test_unknown_backends_are_refused(own_cache):
-    with pytest.raises(
-        UsageError,
-        match="'cuda' does not exist: expected one of compiled, numpy",
-    ):
+    with is_refused(UsageError, argument="backend"):
         choose_backend("cuda")
 
 

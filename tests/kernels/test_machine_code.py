@@ -34,6 +34,7 @@ from cnpgen.kernels.tape import CODES, GridSpec, Loop, Tape, tape_from_function
 from tests.conftest import needs_compiler
 from tests.kernels.c_reference import emit
 from tests.kernels.test_kernels import BINARY, SPECIAL, UNARY, machine_flags
+from tests.refusals import is_refused
 
 Array = np.ndarray
 SETS = {  # model of a processor with each width of vectors, and the flags it needs
@@ -368,7 +369,7 @@ def test_a_forked_process_uses_and_generates_kernels(fresh, tmp_path):
 
 
 def test_ir_that_llvm_refuses_is_a_machine_error():
-    with pytest.raises(MachineError, match="LLVM cannot generate a kernel"):
+    with is_refused(MachineError):
         generate("define nonsense", FINAL)
 
 

@@ -22,6 +22,7 @@ from cnpgen.store.checked_shard import Shard
 from tests.conftest import HANGING
 from tests.examples.grouped import grouped
 from tests.examples.loader import ALL, columns, ids, make, same
+from tests.refusals import is_refused
 
 SIZES = {  # rows and rows per shard
     "one row": ({"train": 1}, 4),
@@ -245,10 +246,7 @@ def test_the_state_after_a_number_of_used_batches_is_computed_without_reading_th
             take(batches, 1)
         assert ahead.state(epoch=1, batch=len(batches)) == batches.state()
         assert (batches.state()["epoch"], batches.state()["row"]) == (2, 0)
-        with pytest.raises(
-            UsageError,
-            match=r"batch must be at most \d, the number of batches of an epoch, got 8",
-        ):
+        with is_refused(UsageError, argument="batch"):
             ahead.state(batch=8)
 
 
@@ -299,7 +297,7 @@ def test_two_loops_over_the_same_batches_are_refused(plain: Dataset) -> None:
     outer = iter(batches)
     next(outer)
     take(batches, 1)
-    with pytest.raises(UsageError, match="another loop over the same batches"):
+    with is_refused(UsageError):
         next(outer)
 
 
@@ -372,10 +370,7 @@ def test_batches_and_rows_are_normalized_to_identical_values(
 def test_a_batch_size_above_the_number_of_rows_needs_drop_last_false(
     plain: Dataset,
 ) -> None:
-    with pytest.raises(
-        UsageError,
-        match=r"batch_size 51 is more than the 50 rows of split 'train'; drop_last=False",
-    ):
+    with is_refused(UsageError, argument="batch_size"):
         plain.batches(51)
     (batch,) = plain.batches(51, options=BatchOptions(drop_last=False))
     assert batch.rows == 50
@@ -394,7 +389,7 @@ def test_a_last_batch_without_rows_for_a_rank_is_refused(plain: Dataset) -> None
     batches = plain.batches(
         9, options=BatchOptions(world=3, drop_last=False)
     )  # 50 = 5 x 9 + 5, but 46 = 5 x 9 + 1
-    with pytest.raises(UsageError, match="has 1 for 3 ranks"):
+    with is_refused(UsageError, argument="batch_size"):
         batches.load_state(batches.state() | {"row": 4})
     assert batches.state()["row"] == 0
 
@@ -436,14 +431,9 @@ def test_invalid_arguments_are_refused(
 def test_unknown_splits_and_fields_are_refused_with_the_nearest_name(
     plain: Dataset,
 ) -> None:
-    with pytest.raises(
-        DatasetError,
-        match=r"no split 'valid' \(did you mean 'validation'\?\), only train, validation, test$",
-    ):
+    with is_refused(DatasetError, argument="split"):
         plain.batches(8, split="valid")
-    with pytest.raises(
-        DatasetError, match=r"no field 'start_dq'.*did you mean 'start_q'"
-    ):
+    with is_refused(DatasetError, argument="fields"):
         plain.batches(8, fields=["start_dq"])
 
 
@@ -452,11 +442,9 @@ def test_the_state_of_another_dataset_or_split_is_refused(
 ) -> None:
     other = load_dataset(make(tmp_path, seed=8))
     batches = plain.batches(8)
-    with pytest.raises(DatasetError, match="of another dataset: fingerprint"):
+    with is_refused(DatasetError):
         batches.load_state(other.batches(8).state())
-    with pytest.raises(
-        DatasetError, match="of another dataset: split 'validation', here 'train'"
-    ):
+    with is_refused(DatasetError):
         batches.load_state(plain.batches(8, split="validation").state())
 
 
@@ -476,11 +464,11 @@ def test_invalid_states_are_refused(
     batches = plain.batches(8)
     with pytest.raises((DatasetError, UsageError), match=message):
         batches.load_state(batches.state() | change)
-    with pytest.raises(UsageError, match="must be what state"):
+    with is_refused(UsageError):
         batches.load_state([1])  # type: ignore[arg-type]
     lacking = batches.state()
     del lacking["seed"]
-    with pytest.raises(UsageError, match="lacks 'seed'"):
+    with is_refused(UsageError):
         batches.load_state(lacking)
 
 

@@ -3,6 +3,7 @@
 import shutil
 from dataclasses import replace
 from pathlib import Path
+from unittest.mock import ANY
 
 import numpy as np
 import pytest
@@ -21,6 +22,7 @@ from cnpgen.store.reader import open_dataset
 from cnpgen.store.shard import read_placements
 from tests.examples.loader import ALL, columns, ids, make
 from tests.examples.store import SPEC, make_shard
+from tests.refusals import is_refused
 
 
 @pytest.fixture(scope="module")
@@ -94,7 +96,7 @@ def test_an_unknown_split_is_refused_and_the_existing_ones_are_named(
         with pytest.raises(DatasetError, match=message) as caught:
             read()
         assert caught.value.argument == "split"
-    with pytest.raises(DatasetError, match="has no field 'start_p'") as caught:
+    with is_refused(DatasetError, argument="fields") as caught:
         dataset.batches(8, fields=["start_p"])
     assert caught.value.argument == "fields"
 
@@ -111,10 +113,7 @@ def test_the_problem_of_a_dataset_is_that_of_its_recipe(tiny) -> None:
 
 
 def test_a_dataset_without_a_problem_is_refused(dataset: Dataset) -> None:
-    with pytest.raises(
-        DatasetError,
-        match=r"two-shards does not contain the problem: pipeline\.problem is missing",
-    ):
+    with is_refused(DatasetError):
         _ = dataset.problem
 
 
@@ -164,19 +163,12 @@ def test_a_frame_of_pandas_contains_its_units(dataset: Dataset) -> None:
 def test_a_frame_of_another_library_or_of_none_is_refused(
     dataset: Dataset, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    with pytest.raises(
-        UsageError, match="library must be one of polars, pandas, got 'spark'"
-    ):
+    with is_refused(UsageError, argument="library"):
         dataset.frame("train", library="spark")
     monkeypatch.setattr("cnpgen.loader.dataset.find_spec", lambda name: None)
-    with pytest.raises(
-        MachineError,
-        match=r"a frame needs polars or pandas, .* pip install 'cnpgen\[polars\]'",
-    ):
+    with is_refused(MachineError):
         dataset.frame("train")
-    with pytest.raises(
-        MachineError, match=r"a frame needs pandas, .* pip install 'cnpgen\[pandas\]'"
-    ):
+    with is_refused(MachineError):
         dataset.frame("train", library="pandas")
 
 
@@ -233,9 +225,7 @@ def test_a_split_is_a_sequence_of_rows(dataset: Dataset) -> None:
 def test_an_invalid_row_index_is_an_index_error_and_a_cnpgen_error(
     dataset: Dataset, row: int | list[int]
 ) -> None:
-    with pytest.raises(
-        RowError, match=r"split 'train' has 50 rows, there is no row (50|-51)"
-    ):
+    with is_refused(RowError, argument="indices"):
         dataset["train"][row]
     assert issubclass(RowError, IndexError)
     assert issubclass(RowError, cnpgen.CnpgenError)
@@ -245,7 +235,7 @@ def test_an_invalid_row_index_is_an_index_error_and_a_cnpgen_error(
 def test_indices_that_are_not_integers_are_refused(
     dataset: Dataset, indices: list[float]
 ) -> None:
-    with pytest.raises(UsageError, match="indices must be a list of integers"):
+    with is_refused(UsageError, argument="indices"):
         dataset.rows("train", indices)
 
 
@@ -281,7 +271,7 @@ def test_a_made_dataset_is_loaded(tiny) -> None:
 def test_an_unfinished_dataset_is_refused_unless_allowed(tmp_path: Path) -> None:
     write_dataset_spec(tmp_path, SPEC)
     make_shard(tmp_path, SPEC, shards(SPEC)[1])
-    with pytest.raises(DatasetError, match="unfinished: 1 of 3 shards"):
+    with is_refused(DatasetError):
         load_dataset(tmp_path)
     dataset = load_dataset(tmp_path, allow_incomplete=True)
     assert dataset.splits == {"train": 18, "validation": 0}
@@ -293,7 +283,7 @@ def test_an_unfinished_dataset_is_refused_unless_allowed(tmp_path: Path) -> None
     assert np.allclose(
         dataset.normalization.mean["start_q"], rows.mean(0), rtol=0, atol=1e-15
     )  # type: ignore[union-attr]
-    with pytest.raises(UsageError, match="more than the 0 rows"):
+    with is_refused(UsageError, argument="batch_size"):
         dataset.batches(1, split="validation")
     assert (
         list(
@@ -310,10 +300,7 @@ def test_a_dataset_without_training_rows_needs_the_normalization_of_another_one(
     dataset: Dataset, tmp_path: Path
 ) -> None:
     lonely = load_dataset(make(tmp_path, splits={"test": 9}))
-    with pytest.raises(
-        DatasetError,
-        match="no training rows for the normalization; pass normalize=False",
-    ):
+    with is_refused(DatasetError):
         lonely.batches(3, split="test")
     raw = np.concatenate(
         [
@@ -340,18 +327,14 @@ def test_a_dataset_without_training_rows_needs_the_normalization_of_another_one(
 
 @pytest.mark.parametrize("option", ["allow_incomplete", "verify"])
 def test_options_must_be_bools(tmp_path: Path, option: str) -> None:
-    with pytest.raises(UsageError, match=f"{option} must be True or False, got 'no'"):
+    with is_refused(UsageError, argument=ANY):
         load_dataset(make(tmp_path), **{option: "no"})  # type: ignore[arg-type]
 
 
 def test_folders_without_a_dataset_are_refused(tmp_path: Path) -> None:
-    with pytest.raises(
-        UsageError, match=r"is not a dataset of cnpgen: it has no specification\.json$"
-    ):
+    with is_refused(UsageError, argument="folder"):
         load_dataset(tmp_path)
-    with pytest.raises(
-        UsageError, match="nowhere is not there, expected the folder of a dataset"
-    ):
+    with is_refused(UsageError, argument="folder"):
         load_dataset(tmp_path / "nowhere")
 
 
@@ -364,10 +347,7 @@ def test_missing_and_cut_off_shards_are_detected_when_the_dataset_is_opened(
         path.unlink()
     else:
         path.write_bytes(path.read_bytes()[:-1])
-    with pytest.raises(
-        DatasetError,
-        match=r"is damaged: .*shard-00000\.h5 (is missing|has \d+ bytes instead of)",
-    ):
+    with is_refused(DatasetError):
         load_dataset(copy)
     dataset = load_dataset(copy, allow_incomplete=True)
     assert dataset.splits == {"train": 18, "validation": 10}
@@ -386,12 +366,9 @@ def test_a_changed_byte_is_detected_when_the_shard_is_read(copy: Path) -> None:
     content[(read_placements(path)[0]["start_q"].offset or 0) + 3] ^= 1
     path.write_bytes(content)
     dataset = load_dataset(copy)
-    with pytest.raises(
-        DatasetError,
-        match=r"shard-00001\.h5 is damaged: its sha256 is not the recorded one",
-    ):
+    with is_refused(DatasetError):
         list(dataset.batches(10))
-    with pytest.raises(DatasetError, match="sha256"):
+    with is_refused(DatasetError):
         dataset["train"][-1]
     assert (
         len(dataset["train"][:32]["start_q"]) == 32
@@ -416,10 +393,7 @@ def test_a_shard_of_another_dataset_is_detected(
 def test_a_shard_that_is_deleted_during_use_raises_an_error(copy: Path) -> None:
     dataset = load_dataset(copy)
     (copy / "train" / "shard-00001.h5").unlink()
-    with pytest.raises(
-        DatasetError,
-        match=r"shard-00001\.h5 is missing; run make_dataset or 'cnpgen make-dataset' again with the same arguments",
-    ):
+    with is_refused(DatasetError):
         list(dataset.batches(10))
 
 
@@ -436,10 +410,7 @@ def test_statistics_of_another_specification_are_refused(
 ) -> None:
     other = make(tmp_path / "other", seed=3)
     shutil.copy(other / "stats.json", copy / "stats.json")
-    with pytest.raises(
-        DatasetError,
-        match=r"stats\.json is of another specification than specification\.json",
-    ):
+    with is_refused(DatasetError):
         load_dataset(copy)
 
 

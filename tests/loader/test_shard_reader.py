@@ -17,6 +17,7 @@ from cnpgen.loader.shard_reader import ShardReader
 from cnpgen.store.checked_shard import Shard
 from tests.examples.loader import columns, make
 from tests.examples.store import FIELDS
+from tests.refusals import is_refused
 
 
 @pytest.fixture
@@ -137,10 +138,7 @@ def test_a_shard_that_is_cut_off_after_its_check_raises_an_error(shard: Shard) -
     reader = ShardReader(verify=True)
     reader.read(shard, FIELDS)
     shard.path.write_bytes(shard.path.read_bytes()[:100])
-    with pytest.raises(
-        DatasetError,
-        match=r"has 100 bytes instead of \d+; run make_dataset or 'cnpgen make-dataset' again with the same arguments",
-    ):
+    with is_refused(DatasetError):
         reader.read(shard, FIELDS)
 
 

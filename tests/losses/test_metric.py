@@ -24,6 +24,7 @@ from cnpgen.problems.constraints.pose import Pose
 from cnpgen.problems.constraints.table import Table
 from tests.examples.constraints import TipSpeed
 from tests.examples.losses import loss
+from tests.refusals import is_refused
 
 E = math.e
 
@@ -214,9 +215,7 @@ def test_a_restored_metric_continues_with_identical_bits(settings, cut):
     ],
 )
 def test_the_state_of_another_metric_is_refused(state):
-    with pytest.raises(
-        UsageError, match=r"not the state of a metric|a metric of 1 terms, expected 2"
-    ):
+    with is_refused(UsageError, argument="state"):
         Metric([1.0, 1.0], [1.0, 1.0]).load_state(state)
 
 

@@ -18,6 +18,7 @@ from cnpgen.problems.problem_record import as_record, open_problem
 from cnpgen.schema.catalogue import list_recipes
 from cnpgen.trajectory.boundary import Boundary
 from tests.examples.example_robots import needs_robots
+from tests.refusals import is_refused
 
 GOALS = [[1.0, 0.1], [3.0, 0.0], [1.1, -0.2]]  # m; the second is out of reach
 ANGLES = [0.0, 0.1, 0.2]  # rad
@@ -92,9 +93,7 @@ def test_columns_of_a_wrong_shape_are_refused(columns, message):
 
 @pytest.mark.slow
 def test_without_a_table_positions_need_all_three_coordinates():
-    with pytest.raises(
-        UsageError, match=r"goal_xyz must have shape \(3,\) or \(N, 3\), got \(2,\)"
-    ):
+    with is_refused(UsageError, argument="goal_xyz"):
         complete("heavy-object", start_xyz=[0.4, -0.4, 0.3], goal_xyz=[0.4, 0.4])
     assert complete(
         "heavy-object", start_xyz=[0.4, -0.4, 0.3], goal_xyz=[0.4, 0.4, 0.3]
@@ -213,9 +212,7 @@ def test_a_table_of_nothing_but_a_size_is_refused(tmp_path):
         "goal_xyz.x,goal_xyz.y\n1,2\n", encoding="utf-8"
     )
     os.truncate(tmp_path / "tasks.csv", 1 << 40)
-    with pytest.raises(
-        DatasetError, match="has 1,099,511,627,776 bytes, expected a table of at most"
-    ):
+    with is_refused(DatasetError):
         complete("airhockey-replan", tmp_path / "tasks.csv")
 
 
@@ -223,10 +220,7 @@ def test_a_table_without_heights_is_refused_where_no_table_gives_them(tmp_path):
     (tmp_path / "tasks.csv").write_text(
         "goal_xyz.x,goal_xyz.y\n1,0\n", encoding="utf-8"
     )
-    with pytest.raises(
-        DatasetError,
-        match=r"tasks\.csv lacks goal_xyz\.z beside goal_xyz\.x, goal_xyz\.y",
-    ):
+    with is_refused(DatasetError):
         complete("heavy-object", tmp_path / "tasks.csv")
 
 

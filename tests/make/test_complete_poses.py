@@ -16,6 +16,7 @@ from cnpgen.problems.problem import Problem
 from cnpgen.refine.goal_options import goal_groups, min_durations, refine_to_any
 from cnpgen.refine.task import Attempt, Outcome
 from tests.examples.shaped_robot import SELF, write_problem
+from tests.refusals import is_refused
 
 VELOCITY = '[[constraint]]\nuse = "joint-velocity"\ntolerance = "0.2 %"\n'
 GOALS = [
@@ -96,10 +97,7 @@ def test_goal_states_meet_the_constraints_of_the_problem(tmp_path: Path) -> None
 
 
 def test_tolerances_in_degrees_are_refused(problem: Problem) -> None:
-    with pytest.raises(
-        UsageError,
-        match=r"at most 25.13 rad, got .* in task 0; 180 rad is 10313 deg; did you mean 180 deg",
-    ):
+    with is_refused(UsageError, argument="goal_rotation_tolerance"):
         cnpgen.complete(
             problem, goal_xyz=GOALS[0], goal_rotation_tolerance=[0.0, 0.0, 180.0]
         )
@@ -161,7 +159,7 @@ def test_the_command_takes_tables_of_poses(
     problems = cnpgen.load_boundary_problems(out)
     assert len(problems) == len(problems.columns["goal_option"]) > 1
     table.write_text("goal_xyz.x,goal_xyz.y\n1,2\n", encoding="utf-8")
-    with pytest.raises(DatasetError, match=r"lacks goal_xyz\.z"):
+    with is_refused(DatasetError):
         cnpgen.complete(crane, table)
 
 
@@ -245,7 +243,5 @@ def test_tasks_with_one_number_are_refused_instead_of_merged(problem: Problem) -
         cnpgen.complete(problem, goal_xyz=goal).plans
         for goal in (GOALS[0], [0.4, 0.3, 0.5])
     )
-    with pytest.raises(
-        UsageError, match=r"plans have several tasks with the sample_id 0"
-    ):
+    with is_refused(UsageError, argument="plans"):
         cnpgen.solve_plans(concatenate([first, second]), workers=1)

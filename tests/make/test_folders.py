@@ -21,6 +21,7 @@ from cnpgen.store.dataset_spec import load_dataset_spec
 from cnpgen.validate.validate_dataset import validate_dataset
 from tests.conftest import TINY_SHARD, some, tiny_recipe
 from tests.examples.tiny_datasets import digests, flip, make_tiny, snapshot
+from tests.refusals import is_refused
 
 
 @pytest.fixture
@@ -52,19 +53,14 @@ def test_another_dataset_in_the_folder_is_refused_and_not_touched(folder, what):
 
 def test_another_recipe_in_the_folder_is_refused_and_not_touched(folder):
     before = snapshot(folder)
-    with pytest.raises(
-        UsageError,
-        match=r"holds another dataset \(name airhockey-hit instead of heavy-object",
-    ):
+    with is_refused(UsageError, argument="out"):
         make_tiny(folder, "heavy-object")
     changed = tiny_recipe("airhockey-hit")
     stages = changed.pipeline.stage
     changed = replace(
         changed, pipeline=replace(changed.pipeline, stage=(*stages, stages[-1]))
     )
-    with pytest.raises(
-        UsageError, match=r"holds another dataset \(another recipe\); choose"
-    ):
+    with is_refused(UsageError, argument="out"):
         make_dataset(changed, folder, workers=1, shard_size=TINY_SHARD)
     assert snapshot(folder) == before
 
@@ -135,7 +131,7 @@ def test_a_recipe_that_accepts_nothing_does_not_block_the_folder_for_the_correct
     tmp_path, monkeypatch
 ):
     hopeless(monkeypatch)
-    with pytest.raises(RecipeError, match=r"0 of .* candidates were accepted"):
+    with is_refused(RecipeError):
         make_tiny(tmp_path / "out", seed=1, shard_size=77)
     monkeypatch.undo()
     assert (tmp_path / "out" / "specification.json").is_file()
@@ -165,10 +161,7 @@ def test_a_damaged_specification_with_rows_is_refused_unless_forced(folder, cont
     else:
         (folder / "specification.json").write_bytes(content)
     before = snapshot(folder)
-    with pytest.raises(
-        DatasetError,
-        match=r"specification.json is damaged: .*; force=True replaces the whole dataset",
-    ):
+    with is_refused(DatasetError, argument="force"):
         make_tiny(folder)
     assert snapshot(folder) == before
     assert make_tiny(folder, force=True).complete
@@ -193,10 +186,7 @@ def test_force_works_where_the_specification_is_damaged_and_a_record_or_all_docu
 
 def test_force_works_where_the_specification_is_lost(folder):
     (folder / "specification.json").unlink()
-    with pytest.raises(
-        DatasetError,
-        match=r"specification.json is missing; force=True replaces the whole dataset",
-    ):
+    with is_refused(DatasetError, argument="force"):
         make_tiny(folder)
     assert make_tiny(folder, force=True).complete
     assert validate_dataset(folder).ok
@@ -216,9 +206,7 @@ def test_a_folder_that_is_no_dataset_is_refused_and_not_touched(tmp_path, force,
     if spec is not None:
         (tmp_path / "specification.json").write_text(spec)
     before = snapshot(tmp_path)
-    with pytest.raises(
-        UsageError, match="not empty and not a dataset of cnpgen; choose another out="
-    ):
+    with is_refused(UsageError, argument="out"):
         make_tiny(tmp_path, force=force)
     assert snapshot(tmp_path) == before
 
@@ -226,7 +214,7 @@ def test_a_folder_that_is_no_dataset_is_refused_and_not_touched(tmp_path, force,
 def test_no_other_path_hides_the_content_of_a_folder(tmp_path):
     (tmp_path / "mine").mkdir()
     (tmp_path / "mine" / "README.md").write_text("mine")
-    with pytest.raises(UsageError, match="not empty and not a dataset of cnpgen"):
+    with is_refused(UsageError, argument="out"):
         make_tiny(tmp_path / "missing" / ".." / "mine")
     assert snapshot(tmp_path) == {"mine/README.md": b"mine"}
 
@@ -238,7 +226,7 @@ def test_no_other_path_hides_the_content_of_a_folder(tmp_path):
 def test_force_does_not_delete_a_dataset_with_foreign_files(folder, name):
     (folder / name).write_text("mine")
     before = snapshot(folder)
-    with pytest.raises(UsageError, match=f"{name}, which is not part of the dataset"):
+    with is_refused(UsageError):
         make_tiny(folder, seed=3, force=True)
     assert snapshot(folder) == before
 
@@ -246,9 +234,7 @@ def test_force_does_not_delete_a_dataset_with_foreign_files(folder, name):
 def test_force_does_not_follow_a_link_out_of_the_folder(folder, tmp_path):
     shutil.move(folder / "train", tmp_path / "precious")
     (folder / "train").symlink_to(tmp_path / "precious")
-    with pytest.raises(
-        UsageError, match="train is a link that leads outside the folder of the dataset"
-    ):
+    with is_refused(UsageError):
         make_tiny(folder, seed=3, force=True)
     assert len(list((tmp_path / "precious").iterdir())) == 6
 
@@ -263,9 +249,7 @@ def test_a_deletion_that_is_cut_off_leaves_what_force_can_delete(folder, monkeyp
         unlink(self, missing_ok=missing_ok)
 
     monkeypatch.setattr(Path, "unlink", refuse)
-    with pytest.raises(
-        MachineError, match=r"cannot delete from .*: Input/output error"
-    ):
+    with is_refused(MachineError):
         make_tiny(folder, seed=3, force=True)
     monkeypatch.undo()
     assert not (folder / "manifest.json").exists()
@@ -405,15 +389,10 @@ def test_a_folder_that_is_deleted_while_the_dataset_is_made_is_said_to_be_that(
     tmp_path,
 ):
     out = tmp_path / "out"
-    with pytest.raises(
-        MachineError,
-        match=rf"^{out}: it was deleted or moved while the dataset was made; make it again$",
-    ):
+    with is_refused(MachineError):
         make_tiny(out, progress=lambda *_: shutil.rmtree(out))
     assert not out.exists()
-    with pytest.raises(
-        MachineError, match=r": its specification\.json was deleted or moved"
-    ):
+    with is_refused(MachineError):
         make_tiny(out, progress=lambda *_: (out / "specification.json").unlink())
 
 
@@ -479,6 +458,6 @@ def test_arguments_that_make_no_sense_are_refused_before_anything_is_touched(
 
 
 def test_a_recipe_that_does_not_exist_is_a_recipe_error(tmp_path):
-    with pytest.raises(RecipeError, match="airhockey-replan"):
+    with is_refused(RecipeError, argument="recipe"):
         make_dataset("airhockey-replay", tmp_path / "out")
     assert not (tmp_path / "out").exists()

@@ -32,6 +32,7 @@ from cnpgen.store.workspace import find_workspace, open_workspace
 from cnpgen.validate.validate_dataset import validate_dataset
 from tests.conftest import SHIPPED, TINY_SHARD, columns_of, some, tiny_recipe
 from tests.examples.tiny_datasets import SHARDS, digests, make_tiny, snapshot
+from tests.refusals import is_refused
 
 # --- the same rows however they are made ------------------------------------------------------------------------------
 
@@ -229,9 +230,7 @@ def test_parts_share_no_shard_and_leave_none(job, m):
 def test_force_would_delete_what_other_parts_made(tiny, tmp_path):
     folder = Path(shutil.copytree(tiny("airhockey-hit"), tmp_path / "out"))
     before = snapshot(folder)
-    with pytest.raises(
-        UsageError, match="force=True would delete what the other parts have made"
-    ):
+    with is_refused(UsageError, argument="force"):
         make_tiny(folder, part=(0, 2), force=True)
     assert snapshot(folder) == before
 
@@ -253,19 +252,13 @@ def test_a_shard_that_pinocchio_disagrees_with_is_not_written(tmp_path, monkeypa
             yield columns, sampling, scenes
 
     monkeypatch.setattr(make, "shard_columns", wrong)
-    with pytest.raises(
-        MachineError,
-        match=r"row 249 of split 'train' fails Pinocchio's check .*try another backend=",
-    ):
+    with is_refused(MachineError, argument="backend"):
         make_tiny(tmp_path / "out")
     assert not digests(tmp_path / "out")
     monkeypatch.setattr(
         make, "package_of", lambda _group, kind: "my-hits" if kind is StartIK else ""
     )
-    with pytest.raises(
-        MachineError,
-        match="what my-hits samples or solves is not what it measures, or the",
-    ):
+    with is_refused(MachineError, argument="backend"):
         make_tiny(tmp_path / "out")
 
 

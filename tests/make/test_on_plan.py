@@ -27,6 +27,7 @@ from cnpgen.schema.keys import Range
 from cnpgen.trajectory.boundary import Boundary
 from cnpgen.validate.validate_dataset import validate_dataset
 from tests.conftest import Arm, Prepare, run_stages
+from tests.refusals import is_refused
 
 MODEL = "airhockey-replan"
 OFF = {
@@ -124,9 +125,9 @@ def test_another_file_or_a_model_of_another_problem_is_refused(first) -> None:
     context = first[0].context
     with pytest.raises(RecipeError, match="expected " + "0" * 64):
         load_stage_planner(MODEL, "0" * 64, context)
-    with pytest.raises(RecipeError, match="'heavy-object' plans for another problem"):
+    with is_refused(RecipeError):
         load_stage_planner("heavy-object", model_sha256("heavy-object"), context)
-    with pytest.raises(UsageError, match="unknown model"):
+    with is_refused(UsageError, argument="name_or_path"):
         load_stage_planner("airhockey-hot", "0" * 64, context)
 
 

@@ -25,6 +25,7 @@ from cnpgen.schema.catalogue import list_recipes
 from cnpgen.schema.keys import Range
 from cnpgen.trajectory.trajectory_spec import TrajectorySpec
 from tests.examples.stages import Roll
+from tests.refusals import is_refused
 
 
 @pytest.fixture
@@ -102,7 +103,7 @@ def test_a_split_without_rows_is_left_out_and_the_order_is_kept(recipe):
 
 @pytest.mark.parametrize("n", [0, -1])
 def test_no_rows_is_a_usage_error(recipe, n):
-    with pytest.raises(UsageError, match="at least 1"):
+    with is_refused(UsageError, argument="n"):
         split_rows(recipe, n)
 
 
@@ -242,9 +243,7 @@ def test_notes_that_are_a_link_to_another_folder_are_not_passed_on(tmp_path):
         (folder / "hits.toml").write_text(shipped.read_text())
         (folder / "notes.txt").write_text("what I saw")
         (folder / "hits.md").symlink_to(target)
-    with pytest.raises(
-        RecipeError, match=r"hits.md: is a link that leads to another folder"
-    ):
+    with is_refused(RecipeError):
         load_notes(load_dataset_recipe(tmp_path / "theirs" / "hits.toml"))
     assert (
         load_notes(load_dataset_recipe(tmp_path / "mine" / "hits.toml")) == "what I saw"
@@ -252,10 +251,7 @@ def test_notes_that_are_a_link_to_another_folder_are_not_passed_on(tmp_path):
 
 
 def test_an_object_must_be_thicker_than_its_contacts_may_be_deep(tmp_path):
-    with pytest.raises(
-        RecipeError,
-        match=r"object: is 0.002 m thin, where contacts 0.001 m deep are legal",
-    ):
+    with is_refused(RecipeError):
         load_problem(thin_object(tmp_path, "[200, 200, 2] mm"))
     assert (
         load_problem(thin_object(tmp_path, "[200, 200, 2.1] mm")).object.size[2]
@@ -277,8 +273,5 @@ def test_no_motion_can_be_asked_to_hold_an_equality_with_a_tolerance_of_zero(
         f'{head}use = "{key}"'
         + re.sub(r"(?m)^tolerance = .*$", "tolerance = 0", rest, count=1)
     )
-    with pytest.raises(
-        RecipeError,
-        match=r"tolerance: 0\.0 m?(rad)? is too small, expected at least 1e-09",
-    ):
+    with is_refused(RecipeError):
         load_problem(path)

@@ -26,6 +26,7 @@ from cnpgen.scenes import (
 )
 from cnpgen.world.pose_ik import PoseKinematics
 from tests.examples.shaped_robot import SELF, write_problem
+from tests.refusals import is_refused
 
 LIMITS = """[[constraint]]
 use = "joint-velocity"
@@ -116,17 +117,11 @@ def test_joints_are_ordered_by_name_and_checked(crane: Path) -> None:
     plans = scene_plans(problem, [scene])
     assert plans.boundary.start_q[0] == pytest.approx(START)
     assert plans.boundary.goal_q[0] == pytest.approx(GOAL)
-    with pytest.raises(SceneError, match="scene 'post' has no joint 'swing'"):
+    with is_refused(SceneError):
         scene_plans(problem, [replace(scene, joint_names=(*names[:4], "slew"))])
-    with pytest.raises(
-        SceneError,
-        match="scene 'post' has 5 joint positions at the start, the robot has 4",
-    ):
+    with is_refused(SceneError):
         scene_plans(problem, [replace(scene, joint_names=())])
-    with pytest.raises(
-        SceneError,
-        match=r"scene 'post': lift is 2\.7000 rad at the goal, outside of its limits",
-    ):
+    with is_refused(SceneError):
         scene_plans(problem, [replace(SCENES[0], goal_q=np.array([[0, 2.7, 0, 0]]))])
 
 
@@ -135,7 +130,7 @@ def test_problems_that_ignore_obstacles_are_refused(tmp_path: Path) -> None:
     file.write_text(
         file.read_text().replace('use = "robot-clearance"', 'use = "joint-velocity"')
     )
-    with pytest.raises(UsageError, match="no constraint robot-clearance"):
+    with is_refused(UsageError, argument="problem"):
         scene_plans(cnpgen.load_problem(file), SCENES)
 
 
@@ -263,7 +258,7 @@ def test_earlier_plans_are_initial_guesses_for_moved_obstacles(crane: Path) -> N
     steps = [sum(result.iterations for result in found.results) for found in (after, scratch)]  # fmt: skip
     assert steps[0] < steps[1] / 2
     assert (after.plans.duration < 1.02 * scratch.plans.duration).all()
-    with pytest.raises(UsageError, match="one plan for each of 3 scenes"):
+    with is_refused(UsageError, argument="initial"):
         solve_scenes(crane, moved, run=SceneOptions(initial=before.plans[:2]))
 
 

@@ -11,6 +11,7 @@ from cnpgen.pipelines.prepared import PreparedPipeline
 from cnpgen.pipelines.stages.stage import Stage
 from cnpgen.store.field import Field
 from tests.conftest import SHIPPED, Arm, Prepare
+from tests.refusals import is_refused
 
 TASK = {  # columns of the tasks; the completed values are compared with their row
     "airhockey-hit": ("start_q", "goal_xyz", "hit_angle", "hit_speed"),
@@ -193,10 +194,7 @@ def test_unknown_columns_raise_an_error(prepare, given, message):
 
 def test_two_speeds_of_one_hit_raise_an_error(prepare):
     prepared = prepare("airhockey-hit")
-    with pytest.raises(
-        UsageError,
-        match="hit_speed and hit_speed_share both define the speed of the hit",
-    ):
+    with is_refused(UsageError):
         Completion(
             prepared.pipeline,
             prepared.context,
@@ -242,9 +240,7 @@ def test_plug_in_stages_keep_given_outputs_and_replace_random_values_by_their_me
         prepared, {**task, "mass": np.array([[7.0]]), "drag": np.array([[1.0]])}
     )
     assert given["mass"].item() == 7.0
-    with pytest.raises(
-        UsageError, match="mass: tasks that give this must also give drag"
-    ):
+    with is_refused(UsageError):
         completed(prepared, {**task, "mass": np.array([[7.0]])})
 
 

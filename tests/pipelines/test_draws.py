@@ -14,6 +14,7 @@ from cnpgen.pipelines.stages.hit_angle import wrap
 from cnpgen.pipelines.stages.stage import CandidateBatch
 from cnpgen.schema.keys import Range
 from tests.conftest import SHIPPED, Prepare, run_stages
+from tests.refusals import is_refused
 
 DRAWS = 40_000
 PROBABLE = (
@@ -124,7 +125,7 @@ def test_start_and_goal_have_the_minimum_distance(drawn):
 def test_boxes_out_of_reach_are_a_mistake_in_the_recipe(prepare):
     stage = stage_of(prepare("airhockey-hit"), "DrawPositions")
     far = replace(stage, goal=(Range(2.0, 3.0), Range(0.0, 0.1), Range(0.16, 0.16)))
-    with pytest.raises(RecipeError, match=r"goal: the whole box .* is out of reach"):
+    with is_refused(RecipeError):
         far.prepare(prepare("airhockey-hit").context)
 
 
@@ -345,11 +346,9 @@ def test_joint_and_sequential_rejections_have_the_same_reasons():
 
 def test_columns_of_the_wrong_length_raise_an_error():
     candidates = CandidateBatch(4)
-    with pytest.raises(
-        ValueError, match=r"column 'x' must have shape \(width, 4\), got \(2, 3\)"
-    ):
+    with is_refused(ValueError):
         candidates["x"] = np.zeros((2, 3))
-    with pytest.raises(ValueError, match="column 'x'"):
+    with is_refused(ValueError):
         candidates["x"] = np.zeros(4)
 
 

@@ -19,6 +19,7 @@ from cnpgen.store.reader import open_dataset
 from cnpgen.store.shard_record import load_record
 from cnpgen.validate.validate_dataset import validate_dataset
 from tests.conftest import Arm, Prepare
+from tests.refusals import is_refused
 
 LIST = """\
 name = "listed"
@@ -118,22 +119,17 @@ def test_shards_of_one_row_hold_the_same_rows_and_the_same_counts(recipe, tmp_pa
 
 
 def test_more_rows_than_solved_tasks_raise_an_error_with_the_reasons(recipe, tmp_path):
-    with pytest.raises(
-        UsageError,
-        match=r"2 rows, of 4 tasks \(2 no hitting configuration\): got n = 3",
-    ):
+    with is_refused(UsageError):
         make_dataset(load_dataset_recipe(recipe(THREE)), tmp_path / "rows", n=3)
     assert not (tmp_path / "rows").exists()
     for n in (3, 5):
-        with pytest.raises(UsageError, match=r"listed: .* rows are requested"):
+        with is_refused(UsageError):
             draw_boundary_problems(recipe(THREE), n)
     assert len(draw_boundary_problems(recipe(THREE), 2)) == 2
 
 
 def test_a_dataset_without_solved_tasks_raises_an_error(recipe, tmp_path):
-    with pytest.raises(
-        UsageError, match=r"0 rows, of 1 tasks \(1 no hitting configuration\)"
-    ):
+    with is_refused(UsageError):
         make_dataset(
             load_dataset_recipe(recipe('goal = ["[3.0, 0, 0.16] m"]')),
             tmp_path / "rows",
@@ -147,7 +143,7 @@ def test_two_splits_of_the_same_tasks_raise_an_error(recipe, tmp_path):
         'name = "d"\npipeline = "listed.toml"\n[splits]\ntrain = 1\ntest = 1\n',
         encoding="utf-8",
     )
-    with pytest.raises(UsageError, match="the same in its splits train, test"):
+    with is_refused(UsageError):
         make_dataset(load_dataset_recipe(dataset), tmp_path / "rows")
 
 
@@ -215,7 +211,5 @@ def test_the_mallet_is_behind_the_puck_on_the_line_of_the_hit():
 
 def test_another_distance_than_that_of_the_problem_is_a_mistake():
     problem = load_problem("airhockey")
-    with pytest.raises(
-        RecipeError, match=r"distance: expected 0.07 m, as in puck-contact, got 0.06 m"
-    ):
+    with is_refused(RecipeError):
         BehindPuck(distance=0.06).prepare(Context(problem, load_robot(problem), None))

@@ -14,6 +14,7 @@ from cnpgen.schema import registry
 from cnpgen.schema.catalogue import read_kind
 from cnpgen.schema.keys import RecipeLocation
 from tests.conftest import Arm, Prepare, run_stages
+from tests.refusals import is_refused
 
 EXACT = 1e-9  # m and rad
 ENDS = [
@@ -210,9 +211,7 @@ def test_the_goal_is_solved_from_the_start(prepare):
 def test_a_guess_of_the_wrong_length_is_a_mistake_in_the_recipe(prepare):
     prepared = prepare("airhockey-replan")
     stage = prepared.pipeline.stage[1]
-    with pytest.raises(
-        RecipeError, match="guess: needs 6 ranges, one per planned joint, got 5"
-    ):
+    with is_refused(RecipeError):
         replace(stage, guess=stage.guess[:5]).prepare(prepared.context)
 
 

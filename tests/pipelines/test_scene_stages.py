@@ -30,6 +30,7 @@ from tests.conftest import needs_compiler
 from tests.examples.numpy_observations import signed_distances
 from tests.examples.obstacles import draw_obstacle
 from tests.examples.scene_arm import obstacles_of, write_scene_pipeline
+from tests.refusals import is_refused
 
 
 @pytest.fixture(scope="module")
@@ -122,7 +123,7 @@ def test_scenes_with_too_many_obstacles_are_rejected(
     kept = candidates.scenes.table[np.unique(candidates.scene)]
     assert ((kept.obstacle_kind == 0).sum(axis=1) <= 3).all()
     assert candidates.reasons[0] == TOO_MANY
-    with pytest.raises(RecipeError, match="capacity: the problem has places for"):
+    with is_refused(RecipeError):
         stage.prepare(context)
 
 

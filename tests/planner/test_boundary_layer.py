@@ -22,6 +22,7 @@ from tests.examples.plans_of_networks import (
     boundary_for_layer,
     outputs,
 )
+from tests.refusals import is_refused
 
 PROBLEMS = ("airhockey", "heavy-object")
 GIVEN = "airhockey, accelerations given"
@@ -241,35 +242,21 @@ def test_a_boundary_layer_can_be_pickled_after_use(
 def test_invalid_arguments_raise_errors(layers: dict[str, BoundaryLayer]) -> None:
     layer, given = layers["airhockey"], boundary("airhockey", 2)
     tasks, (phi, log_rate) = layer.tasks(given), outputs(layer, 2)
-    with pytest.raises(
-        UsageError, match=r"phi must have shape \(2, 60\), got \(2, 59\)"
-    ):
+    with is_refused(UsageError, argument="phi"):
         layer(tasks, phi[:, 1:], log_rate)
-    with pytest.raises(
-        UsageError, match=r"log_rate must have shape \(2, 20\), got \(1, 20\)"
-    ):
+    with is_refused(UsageError, argument="log_rate"):
         layer(tasks, phi, log_rate[1:])
-    with pytest.raises(
-        UsageError, match=r"goal_q must have shape \(N, 6\), N = 2, got \(2, 7\)"
-    ):
+    with is_refused(UsageError, argument="goal_q"):
         layer.tasks(replace(given, goal_q=np.zeros((2, 7))))
-    with pytest.raises(UsageError, match="goal_ddq must be None"):
+    with is_refused(UsageError, argument="boundary"):
         layer.tasks(replace(given, goal_ddq=np.zeros((2, 6))))
-    with pytest.raises(
-        UsageError, match='goal_ddq is missing: goal_acceleration is "given"'
-    ):
+    with is_refused(UsageError, argument="boundary"):
         layers[GIVEN].tasks(given)
-    with pytest.raises(
-        UsageError, match="goal_acceleration must be one of free, given, got 'none'"
-    ):
+    with is_refused(UsageError, argument="goal_acceleration"):
         BoundaryLayer("airhockey", goal_acceleration="none")
-    with pytest.raises(
-        UsageError, match=r"projection_steps must be an integer from 0 on, got 1\.5"
-    ):
+    with is_refused(UsageError, argument="projection_steps"):
         BoundaryLayer("airhockey", projection_steps=1.5)  # type: ignore[arg-type]
-    with pytest.raises(
-        UsageError, match="path_scale must be a finite number, got None"
-    ):
+    with is_refused(UsageError, argument="path_scale"):
         BoundaryLayer("airhockey", path_scale=None)  # type: ignore[arg-type]
 
 
@@ -302,10 +289,7 @@ def test_plans_of_a_shuffled_batch_have_boundary_conditions_and_ids_of_their_row
 def test_boundary_conditions_are_read_from_rows_in_their_units(tiny: Any) -> None:
     dataset = cnpgen.load_dataset(tiny("airhockey-replan"))
     rows = dataset.arrays("train")
-    with pytest.raises(
-        UsageError,
-        match=r"a dict needs normalization=, which is dataset\.normalization, or None",
-    ):
+    with is_refused(UsageError, argument="normalization"):
         Boundary.from_batch(rows)
     plain = next(
         iter(
@@ -324,10 +308,7 @@ def test_boundary_conditions_are_read_from_rows_in_their_units(tiny: Any) -> Non
         Boundary.from_batch({**rows, "goal_ddq": rows["start_ddq"]}, None).fixed_at_goal
         == 3
     )
-    with pytest.raises(
-        UsageError,
-        match="the batch lacks start_ddq, goal_dq: it has the fields start_q, start_dq, goal_q",
-    ):
+    with is_refused(UsageError, argument="batch"):
         Boundary.from_batch(
             {name: rows[name] for name in ("start_q", "start_dq", "goal_q")}, None
         )
@@ -336,10 +317,7 @@ def test_boundary_conditions_are_read_from_rows_in_their_units(tiny: Any) -> Non
 def test_joint_positions_in_degrees_are_refused(layers: Any) -> None:
     given = boundary("airhockey", 4)
     degrees = replace(given, goal_q=np.degrees(given.goal_q))
-    with pytest.raises(
-        UnitError,
-        match=r"goal_q must be from .* rad, got .* in plan 0 of joint_.*did you mean",
-    ):
+    with is_refused(UnitError, argument="boundary"):
         layers["airhockey"].tasks(degrees)
     with pytest.warns(UserWarning, match="goal_q must be from"):
         layers["airhockey"].tasks(degrees, allow_large_angles=True)

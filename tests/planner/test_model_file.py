@@ -21,6 +21,7 @@ from cnpgen.store.files.checksum_file import (
 )
 from tests.conftest import columns_of
 from tests.examples.models import boundary_of_columns, untrained_model
+from tests.refusals import is_refused
 
 
 @pytest.fixture(scope="module")
@@ -64,10 +65,7 @@ def test_a_model_file_contains_the_expected_time_unless_it_is_the_default(
         tmp_path / "w.h5",
         replace(model, config=replace(model.config, expected_time="soon")),
     )
-    with pytest.raises(
-        DatasetError,
-        match="expected_time must be one of distance, reach, travel, got 'soon'",
-    ):
+    with is_refused(DatasetError):
         load_model(tmp_path / "w.h5")
 
 
@@ -93,9 +91,7 @@ def test_a_model_file_contains_options_after_the_network_unless_they_are_default
         tmp_path / "w.h5",
         replace(model, config=replace(model.config, time_parametrized="often")),
     )
-    with pytest.raises(
-        DatasetError, match="time_parametrized must be true or false, got 'often'"
-    ):
+    with is_refused(DatasetError):
         load_model(tmp_path / "w.h5")
 
 
@@ -112,7 +108,7 @@ def test_a_loaded_model_has_its_via_points(model, tmp_path):
         tmp_path / "w.h5",
         replace(model, config=replace(model.config, via_points=((0.1, 0.2),))),
     )
-    with pytest.raises(DatasetError, match="via points must be 6 numbers each"):
+    with is_refused(DatasetError):
         load_model(tmp_path / "w.h5")
 
 
@@ -150,7 +146,7 @@ def test_a_truncated_model_raises_an_error(model, tmp_path, size):
     save_model(tmp_path / "m.h5", model)
     whole = (tmp_path / "m.h5").read_bytes()
     (tmp_path / "m.h5").write_bytes(whole[:size])
-    with pytest.raises(DatasetError, match="damaged"):
+    with is_refused(DatasetError):
         load_model(tmp_path / "m.h5")
 
 
@@ -162,19 +158,15 @@ def test_a_model_with_a_changed_first_block_is_reported_as_damaged(
     data = bytearray((tmp_path / "m.h5").read_bytes())
     data[place] ^= 0x10 if place != 9 else 0x02  # "mmdel"
     (tmp_path / "m.h5").write_bytes(data)
-    with pytest.raises(
-        DatasetError, match=r"m\.h5 is damaged: its first 512 bytes were changed$"
-    ):
+    with is_refused(DatasetError):
         load_model(tmp_path / "m.h5")
 
 
 def test_missing_files_and_files_of_other_kinds_are_named(tmp_path, tiny):
-    with pytest.raises(UsageError, match=r"none\.h5 is not there, expected a model"):
+    with is_refused(UsageError, argument="name_or_path"):
         load_model(tmp_path / "none.h5")
     shard = next(tiny("airhockey-hit").rglob("*.h5"))
-    with pytest.raises(
-        UsageError, match="is a shard of a dataset, expected a model of cnpgen"
-    ):
+    with is_refused(UsageError, argument="name_or_path"):
         load_model(shard)
     other = tmp_path / "other.h5"
     other.write_bytes(
@@ -182,7 +174,7 @@ def test_missing_files_and_files_of_other_kinds_are_named(tmp_path, tiny):
             Content({}, {"a": "b"}), kind="cnpgen-checkpoint", version=1
         )
     )
-    with pytest.raises(UsageError, match="is a checkpoint of cnpgen, expected a model"):
+    with is_refused(UsageError, argument="name_or_path"):
         load_model(other)
 
 
@@ -221,7 +213,7 @@ def test_inconsistent_content_with_a_valid_checksum_raises_an_error(
             Content(arrays, texts), kind=model_file.MODEL_KIND, version=2
         )
     )
-    with pytest.raises(DatasetError, match="does not fit this version"):
+    with is_refused(DatasetError):
         load_model(path)
 
 
@@ -316,14 +308,9 @@ def test_shipped_models_are_found_by_name_and_others_by_path(tmp_path, monkeypat
     assert find_model("airhockey-hit") == Path("/somewhere/airhockey-hit.h5")
     (tmp_path / "mine").touch()
     assert find_model(tmp_path / "mine") == tmp_path / "mine"
-    with pytest.raises(
-        UsageError, match=r"mine\.h5 is not there, expected a model of cnpgen"
-    ):
+    with is_refused(UsageError, argument="name_or_path"):
         find_model("mine.h5")
-    with pytest.raises(
-        UsageError,
-        match=r"unknown model 'airhockey-hot' \(did you mean 'airhockey-hit'\?\)",
-    ):
+    with is_refused(UsageError, argument="name_or_path"):
         find_model("airhockey-hot")
 
 

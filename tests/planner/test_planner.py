@@ -18,6 +18,7 @@ from cnpgen.robots.plausible_values import UnitError
 from cnpgen.trajectory.boundary import Boundary
 from tests.conftest import columns_of, some
 from tests.examples.models import boundary_of_columns, untrained_model
+from tests.refusals import is_refused
 
 
 @pytest.fixture(scope="module")
@@ -142,19 +143,16 @@ def test_one_plan_can_be_replanned_to_several_goals_including_its_own(planner, r
 
 def test_replanning_rejects_plans_of_other_types_and_problems(planner, rows):
     old, goal = planned(planner, rows), {"goal_q": rows.goal_q, "goal_dq": rows.goal_dq}
-    with pytest.raises(UsageError, match=r"must be Plans, .* got Boundary"):
+    with is_refused(UsageError, argument="plans"):
         planner.replan(rows, 0.1, **goal)
     joined = join_plans(
         old, planner.replan(old, 0.5 * old.duration, **goal), at=0.5 * old.duration
     )
-    with pytest.raises(UsageError, match=r"must be Plans, .* got JoinedPlans"):
+    with is_refused(UsageError, argument="plans"):
         planner.replan(joined, 0.1, **goal)
-    with pytest.raises(
-        UsageError,
-        match="the planner is of 'airhockey', the plans are of 'heavy-object'",
-    ):
+    with is_refused(UsageError, argument="plans"):
         planner.replan(draw_boundary_problems("heavy-object", 2, seed=1), 0.0, **goal)
-    with pytest.raises(UsageError, match="goal_q must be from") as caught:
+    with is_refused(UsageError, argument="goal_q") as caught:
         planner.replan(old, 0.0, goal_q=1e4 * rows.goal_q)
     assert caught.value.argument == "goal_q"
 
@@ -196,9 +194,9 @@ def test_start_and_goal_are_positional_and_velocities_are_keyword_arguments(
 ):
     plans = planner.plan(rows.start_q, rows.goal_q)
     np.testing.assert_array_equal(plans.boundary.goal_q, rows.goal_q)
-    with pytest.raises(TypeError, match="goal_q"):
+    with is_refused(TypeError):
         planner.plan(rows.start_q)
-    with pytest.raises(TypeError, match="positional"):
+    with is_refused(TypeError):
         planner.plan(rows.start_q, rows.goal_q, rows.start_dq)
 
 
@@ -217,7 +215,7 @@ def test_rounding_errors_count_as_rest_so_that_rest_to_rest_plans_can_be_replann
     )
     limit = planner.robot.velocity_limit
     planner.plan(rest.start_q, rest.goal_q, start_dq=0.9e-9 * limit)
-    with pytest.raises(UsageError, match="start_dq was zero"):
+    with is_refused(UsageError, argument="start_dq"):
         planner.plan(rest.start_q, rest.goal_q, start_dq=1.1e-9 * limit)
     q, dq, _ = plans.states_at(plans.duration)
     np.testing.assert_allclose(
@@ -252,42 +250,33 @@ def test_reprs_of_planners_models_and_plans(planner, rows):
 
 @pytest.mark.parametrize("wrong", [5, None, b"airhockey-hit"])
 def test_an_invalid_model_argument_raises_an_error_with_its_value(wrong):
-    with pytest.raises(
-        UsageError, match=f"a model must be a name or a path, got {wrong!r}"
-    ):
+    with is_refused(UsageError, argument="model"):
         Planner(wrong)
 
 
 @pytest.mark.parametrize("time", [[0.1, 0.2], "soon", [[0.1]] * 3])
 def test_a_wrong_number_of_times_raises_an_error(planner, rows, time):
     one = planned(planner, rows[:1])
-    with pytest.raises(
-        UsageError, match="time must be one number or one for each of 1 plans, got"
-    ):
+    with is_refused(UsageError, argument="time"):
         planner.replan(one, time, goal_q=rows.goal_q[0])
 
 
 def test_a_time_outside_of_the_plan_raises_an_error(planner, rows):
     plans = planned(planner, rows)
-    with pytest.raises(
-        UsageError, match=r"plan 0 lasts from 0 to .* cannot be evaluated at -0.1 s"
-    ):
+    with is_refused(UsageError, argument="time"):
         planner.replan(plans, -0.1, goal_q=rows.goal_q)
-    with pytest.raises(UsageError, match="cannot be evaluated at 100 s"):
+    with is_refused(UsageError, argument="time"):
         plans.states_at(100.0)
     path, rate = plans.path_control_points * np.nan, plans.rate_control_points * np.nan
     unsolved = replace(plans, path_control_points=path, rate_control_points=rate)
-    with pytest.raises(UsageError, match="plan 0 has no control points yet"):
+    with is_refused(UsageError, argument="plans"):
         planner.replan(unsolved, 0.1, goal_q=rows.goal_q)
 
 
 def test_a_rest_to_rest_model_rejects_moving_starts(tiny, rows):
     resting = boundary_of_columns(columns_of(tiny("airhockey-hit")), 20)
     planner = Planner(untrained_model("airhockey", resting))
-    with pytest.raises(
-        UsageError,
-        match=r"start_dq was zero in every row that the model was trained on, got .* in plan",
-    ):
+    with is_refused(UsageError, argument="start_dq"):
         planned(planner, rows)
     assert len(planned(planner, resting)) == 20
 
@@ -316,7 +305,7 @@ def test_invalid_boundary_conditions_raise_errors_with_their_name(
 
 
 def test_goal_accelerations_raise_an_error_if_the_model_leaves_them_free(planner, rows):
-    with pytest.raises(UsageError, match="goal_ddq must be None"):
+    with is_refused(UsageError, argument="goal_ddq"):
         planner.plan_batch(replace(rows, goal_ddq=np.zeros_like(rows.goal_q)))
 
 
@@ -339,10 +328,7 @@ def test_values_in_degrees_are_refused(planner, rows):
     with pytest.raises(UnitError, match=message) as caught:
         planner.plan(start, rows.goal_q[0])
     assert caught.value.argument == "start_q"
-    with pytest.raises(
-        UnitError,
-        match=r"goal_dq must be from .* rad/s, got 60 rad/s in plan 0 of joint_1",
-    ):
+    with is_refused(UnitError, argument="goal_dq"):
         planner.plan(
             rows.start_q[0], rows.goal_q[0], goal_dq=np.array([60.0, 0, 0, 0, 0, 0])
         )

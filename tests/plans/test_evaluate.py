@@ -5,6 +5,7 @@ from collections.abc import Iterable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
+from unittest.mock import ANY
 
 import numpy as np
 import pytest
@@ -16,6 +17,7 @@ from cnpgen.plans import PlanStatus, load_plans, save_plans
 from cnpgen.plans.evaluate import evaluate_plans
 from tests.examples.plan_files import garbage, plans_of
 from tests.examples.plans import joined, load, perturbed
+from tests.refusals import is_refused
 
 
 def told(verdicts: Iterable[Verdict]) -> list[dict[str, Any]]:
@@ -118,7 +120,7 @@ def test_no_plans_have_no_verdicts() -> None:
     "arguments", [{"step": 0.0}, {"step": np.nan}, {"step": "1ms"}, {"workers": 0}]
 )
 def test_arguments_that_make_no_sense_are_refused(arguments: dict[str, Any]) -> None:
-    with pytest.raises(UsageError, match=r"step|workers"):
+    with is_refused(UsageError, argument=ANY):
         evaluate_plans(plans_of(load("hit")), **arguments)
 
 

@@ -25,6 +25,7 @@ from cnpgen.schema import registry
 from cnpgen.trajectory.spline_motion import Motion
 from tests.examples.installed import installed_kind
 from tests.plans.test_plans import draw_plans, garbage
+from tests.refusals import is_refused
 
 FORMATS = ("npz", "csv", "joint-trajectory")
 FIELDS = ("q", "dq", "ddq", "jerk")
@@ -182,10 +183,7 @@ def test_of_the_plans_that_are_not_chosen_nothing_is_said(tmp_path: Path) -> Non
     assert exported.count == 1
     assert list(exported.refused) == [4]
     for missing in (10, -1):
-        with pytest.raises(
-            UsageError,
-            match=f"there is no plan {missing}: 10 plans, numbered from 0",
-        ):
+        with is_refused(UsageError, argument="only"):
             export_plans(garbage(), tmp_path, to="csv", only=[missing])
 
 
@@ -299,21 +297,16 @@ def test_if_no_plan_can_be_exported_nothing_is_written(
     tmp_path: Path, form: Any
 ) -> None:
     bad = garbage()[np.arange(1, 9)]
-    with pytest.raises(
-        DatasetError,
-        match=r"none of the 8 plans can be exported: plan 0 \(sample 1\): a boundary",
-    ):
+    with is_refused(DatasetError):
         export_plans(bad, tmp_path / "out", to=form)
-    with pytest.raises(DatasetError, match=r"none of the 0 plans can be exported$"):
+    with is_refused(DatasetError):
         export_plans(bad[np.zeros(8, bool)], tmp_path / "out", to=form)
     assert not (tmp_path / "out").exists()
 
 
 @pytest.mark.parametrize("rate", [0.0, -1.0, np.nan, np.inf, 2e6])
 def test_a_rate_that_makes_no_sense_is_refused(tmp_path: Path, rate: float) -> None:
-    with pytest.raises(
-        UsageError, match=r"the rate must be above 0 and at most 1e\+06 Hz, got"
-    ):
+    with is_refused(UsageError, argument="rate"):
         export_plans(draw_plans(), tmp_path, to="csv", rate=rate)
 
 
@@ -321,15 +314,10 @@ def test_wrong_forms_and_places_are_refused(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     plans = draw_plans()
-    with pytest.raises(
-        UsageError, match="unknown exporter 'yaml'; known: npz, csv, joint-trajectory"
-    ):
+    with is_refused(UsageError, argument="to"):
         export_plans(plans, tmp_path, to="yaml")
     (tmp_path / "file").write_text("x")
-    with pytest.raises(
-        UsageError,
-        match="file is a file, but 'csv' makes one file per plan: give a folder",
-    ):
+    with is_refused(UsageError, argument="out"):
         export_plans(plans, tmp_path / "file", to="csv")
 
     def full(*_arguments: object, **_options: object) -> None:
@@ -337,7 +325,7 @@ def test_wrong_forms_and_places_are_refused(
 
     monkeypatch.setattr("os.fsync", full)
     for form in FORMATS:
-        with pytest.raises(MachineError, match="No space left"):
+        with is_refused(MachineError):
             export_plans(plans, tmp_path / f"full-{form}", to=form)
 
 
@@ -366,10 +354,7 @@ def test_a_package_adds_a_format(
         group=registry.EXPORTERS,
     ):
         exported = export_plans(plans, tmp_path, to="durations", only=[1, 0])
-        with pytest.raises(
-            UsageError,
-            match=r"exporter 'duration' \(did you mean 'durations'\?\).* 'cnpgen.exporters'",
-        ):
+        with is_refused(UsageError, argument="to"):
             export_plans(plans, tmp_path, to="duration")
     assert exported.files == (tmp_path / "plans.txt",)
     assert (

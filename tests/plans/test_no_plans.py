@@ -17,6 +17,7 @@ from cnpgen.plans.plans import Plans
 from cnpgen.problems.problem_record import open_problem
 from cnpgen.refine.refine_plans import refine_plans, solve_plans
 from tests.conftest import some
+from tests.refusals import is_refused
 
 MODELS = (
     "airhockey-online",
@@ -60,7 +61,7 @@ def test_what_makes_no_sense_of_nothing_is_refused(
     planner: Planner, none: Plans, tmp_path: Path
 ) -> None:
     for plans in (none, join_plans(none, none)):
-        with pytest.raises(DatasetError, match="none of the 0 plans"):
+        with is_refused(DatasetError):
             export_plans(plans, tmp_path / "out", to="csv")
-    with pytest.raises(UsageError, match="goal_xyz has no rows"):
+    with is_refused(UsageError, argument="goal_xyz"):
         complete("airhockey-replan", goal_xyz=np.zeros((0, 3)))

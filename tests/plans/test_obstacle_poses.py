@@ -17,6 +17,7 @@ from cnpgen.robots.scene import PARKED_POSITION_M
 from cnpgen.robots.solid import place_obstacles
 from cnpgen.trajectory.boundary import Boundary, assemble
 from cnpgen.trajectory.trajectory_spec import TrajectorySpec
+from tests.refusals import is_refused
 
 
 def plans_with(poses: np.ndarray) -> cnpgen.Plans:
@@ -109,5 +110,5 @@ def test_obstacle_poses_are_kept_in_files_and_selections(tmp_path: Path) -> None
     "poses", [np.zeros((2, 5)), np.full((2, 6), np.nan), np.full((2, 6), 1e6)]
 )
 def test_poses_that_do_not_fit_are_refused(poses: np.ndarray) -> None:
-    with pytest.raises(UsageError, match="obstacle_poses"):
+    with is_refused(UsageError, argument="obstacle_poses"):
         _ = plans_with(poses).scene

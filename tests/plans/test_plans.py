@@ -13,6 +13,7 @@ from dataclasses import replace
 from functools import cache
 from pathlib import Path
 from typing import Any
+from unittest.mock import ANY
 
 import h5py
 import numpy as np
@@ -44,6 +45,7 @@ from cnpgen.store.files.checksum_file import with_checksum
 from cnpgen.trajectory.boundary import Boundary, anchor_line, assemble
 from tests.examples.plan_files import remove_checksum
 from tests.examples.shipped import PROBLEMS
+from tests.refusals import is_refused
 
 DOCS = Path(__file__).parents[2] / "docs" / "reference" / "plan-format.md"
 
@@ -196,10 +198,7 @@ def test_a_file_needs_no_other_file(
             replace(problem, robot=replace(problem.robot, urdf="robot.urdf"))
         )
     assert found.problem.comparable_sha256 == plans.problem.comparable_sha256
-    with pytest.raises(
-        DatasetError,
-        match=r"of problem 'mine', not of 'airhockey': they differ in limits.velocity_scale",
-    ):
+    with is_refused(DatasetError):
         load_plans(tmp_path / "plan.h5", problem="airhockey")
 
 
@@ -315,10 +314,7 @@ def test_a_problem_beside_the_file_or_in_the_call(tmp_path: Path) -> None:
     assert load_plans(
         missing, problem=PROBLEMS["heavy-object"]
     ).problem == record_problem(PROBLEMS["heavy-object"])
-    with pytest.raises(
-        UsageError,
-        match=r"b\.h5 does not name its problem: set its attribute 'problem'",
-    ):
+    with is_refused(UsageError, argument="problem"):
         load_plans(missing)
 
 
@@ -362,10 +358,7 @@ def test_another_problem_s_file_is_refused(
         match=rf"plan\.h5 has plans of problem 'airhockey'.*they differ in {key}$",
     ):
         load_plans(tmp_path / "plan.h5", problem=change(PROBLEMS["airhockey"]))
-    with pytest.raises(
-        DatasetError,
-        match=r"of problem 'airhockey', not of 'heavy-object': they differ in robot\.joints",
-    ):
+    with is_refused(DatasetError):
         load_plans(tmp_path / "plan.h5", problem="heavy-object")
 
 
@@ -512,7 +505,7 @@ def test_a_damaged_problem_is_said(tmp_path: Path, recipe: Any) -> None:
     }
     if isinstance(recipe, bytes):
         texts["problem_recipe"] = np.bytes_(recipe)
-    with pytest.raises(DatasetError, match=r"theirs\.h5 is damaged"):
+    with is_refused(DatasetError):
         load_plans(write_minimal(tmp_path / "theirs.h5", attributes=texts))
 
 
@@ -522,9 +515,7 @@ def test_a_changed_problem_is_said(tmp_path: Path) -> None:
         file.attrs["problem_recipe"] = record().recipe.replace(
             '"velocity_scale": 0.8', '"velocity_scale": 0.9'
         )
-    with pytest.raises(
-        DatasetError, match="its problem was changed after it was written"
-    ):
+    with is_refused(DatasetError):
         load_plans(tmp_path / "plan.h5")
 
 
@@ -578,28 +569,20 @@ def test_the_field_that_does_not_fit_the_others_is_named(
 def test_a_link_to_nothing_is_damage(tmp_path: Path) -> None:
     with h5py.File(write_minimal(tmp_path / "theirs.h5"), "a") as file:
         file["start_xyz"] = h5py.SoftLink("/nowhere")
-    with pytest.raises(
-        DatasetError, match=r"theirs\.h5 is damaged: its 'start_xyz' is a link"
-    ):
+    with is_refused(DatasetError):
         load_plans(tmp_path / "theirs.h5")
 
 
 def test_missing_and_foreign_files_are_said(tmp_path: Path) -> None:
     (tmp_path / "text.h5").write_bytes(b"hello")
-    with pytest.raises(
-        UsageError, match=r"text\.h5 is a text file, expected a file of plans"
-    ):
+    with is_refused(UsageError, argument="path"):
         load_plans(tmp_path / "text.h5")
     (tmp_path / "empty.h5").write_bytes(b"")
-    with pytest.raises(
-        DatasetError, match=r"empty\.h5 is not an HDF5 file.*: it is empty"
-    ):
+    with is_refused(DatasetError):
         load_plans(tmp_path / "empty.h5")
-    with pytest.raises(
-        UsageError, match=r"none\.h5 is not there, expected a file of plans"
-    ):
+    with is_refused(UsageError, argument="path"):
         load_plans(tmp_path / "none.h5")
-    with pytest.raises(UsageError, match="is a folder, expected a file of plans"):
+    with is_refused(UsageError, argument="path"):
         load_plans(tmp_path)
     with pytest.raises(RecipeError):
         load_plans(write_minimal(tmp_path / "good.h5"), problem="airhokey")
@@ -688,10 +671,7 @@ def test_a_file_of_a_newer_format_asks_for_an_upgrade(tmp_path: Path) -> None:
     (tmp_path / "plan.h5").write_bytes(
         with_checksum(content, kind="cnpgen-plans", version=2)
     )
-    with pytest.raises(
-        DatasetError,
-        match=r"plan\.h5 has format version 2, this cnpgen reads version 1: upgrade",
-    ):
+    with is_refused(DatasetError):
         load_plans(tmp_path / "plan.h5")
 
 
@@ -846,7 +826,7 @@ def test_plans_that_do_not_fit_are_not_joined(
 ) -> None:
     with pytest.raises(UsageError, match=message):
         concatenate([draw_plans(), draw_plans(**others)])
-    with pytest.raises(UsageError, match="no plans to join"):
+    with is_refused(UsageError):
         concatenate([])
 
 
@@ -952,15 +932,9 @@ def test_boundary_conditions_of_other_joints_and_ragged_ones_are_no_plans(
         for each in ("path_control_points", "rate_control_points")
     }
     others = replace(plans.boundary, **{name: np.zeros((N, 7))})
-    with pytest.raises(
-        UsageError,
-        match=rf"{name} must have shape \(7, 6\) \(plans, joints\), got \(7, 7\)",
-    ):
+    with is_refused(UsageError, argument="boundary"):
         make_plans(plans.problem, others, **points)
-    with pytest.raises(
-        UsageError,
-        match=f"{name} must be an array of numbers, got list: its rows have different lengths",
-    ):
+    with is_refused(UsageError, argument=ANY):
         make_plans(
             plans.problem,
             replace(plans.boundary, **{name: [[1.0], [1.0, 2.0]]}),
@@ -976,10 +950,7 @@ def test_what_is_not_plans_is_refused_by_name(tmp_path: Path) -> None:
         lambda plans: save_plans(tmp_path / "a.h5", plans),
     ]
     for call in calls:
-        with pytest.raises(
-            UsageError,
-            match=r"must be Plans, as load_plans and make_plans return them.* got str",
-        ):
+        with is_refused(UsageError, argument="plans"):
             call("plans.h5")
 
 
@@ -990,7 +961,7 @@ def test_where_plans_are_from_is_kept_in_the_file(tmp_path: Path) -> None:
     save_plans(tmp_path / "a.h5", plans)
     found = load_plans(tmp_path / "a.h5")
     assert (found.source, found.refined_with) == (plans.source, plans.refined_with)
-    with pytest.raises(UsageError, match="source must be a text, got 3"):
+    with is_refused(UsageError, argument="source"):
         replace(plans, source=3)  # type: ignore[arg-type]
 
 
@@ -1003,10 +974,7 @@ def test_a_problem_by_name_that_is_not_the_one_of_the_digest_is_refused(
     tmp_path: Path,
 ) -> None:
     path = write_minimal(tmp_path / "a.h5", attributes={"problem_sha256": "0" * 64})
-    with pytest.raises(
-        DatasetError,
-        match="is of another 'airhockey': its problem_sha256 is not this one's",
-    ):
+    with is_refused(DatasetError):
         load_plans(path)
 
 
@@ -1050,9 +1018,7 @@ def test_only_files_of_plans_are_replaced(tmp_path: Path, content: bytes | str) 
     else:
         path.write_bytes(content)
     before = path.read_bytes()
-    with pytest.raises(
-        UsageError, match=r"mine\.h5 is .*not .*of plans: it is not replaced"
-    ):
+    with is_refused(UsageError, argument="path"):
         save_plans(path, draw_plans())
     assert path.read_bytes() == before
     assert [each.name for each in tmp_path.iterdir()] == ["mine.h5"]
@@ -1071,7 +1037,7 @@ def test_plans_of_anybody_and_empty_files_are_replaced_and_folders_are_made(
     ):
         save_plans(path, draw_plans())
         assert_equal(load_plans(path), draw_plans())
-    with pytest.raises(UsageError, match="new is a folder, expected a file for plans"):
+    with is_refused(UsageError, argument="path"):
         save_plans(tmp_path / "new", draw_plans())
 
 
@@ -1079,25 +1045,22 @@ def test_a_model_is_said_to_be_one(tmp_path: Path) -> None:
     path = tmp_path / "mine.h5"
     save_model(path, load_model("airhockey-hit"))
     for use in (load_plans, lambda path: save_plans(path, draw_plans())):
-        with pytest.raises(
-            UsageError,
-            match=r"mine\.h5 is a model of cnpgen, (expected a file|not one) of plans",
-        ):
+        with is_refused(UsageError, argument="path"):
             use(path)
 
 
 def test_sizes_and_degrees_that_differ_are_not_joined() -> None:
     plans = draw_plans()
     shorter = replace(plans, path_control_points=plans.path_control_points[:, :12])
-    with pytest.raises(UsageError, match="path_control_points"):
+    with is_refused(UsageError):
         concatenate([plans, shorter])
-    with pytest.raises(UsageError, match="the degree is 5 in part 1, but 7 in part 0"):
+    with is_refused(UsageError):
         concatenate([plans, replace(plans, degree=5)])
 
 
 @pytest.mark.parametrize("name", ["duration", "start_q", "status", "a/b", ""])
 def test_columns_cannot_have_the_name_of_something_else(name: str) -> None:
-    with pytest.raises(UsageError, match="a column cannot be called"):
+    with is_refused(UsageError, argument="columns"):
         draw_plans(columns={name: np.zeros(N)})
 
 
@@ -1230,10 +1193,7 @@ def test_a_problem_in_another_folder_is_not_opened(
             lambda *_, **__: pytest.fail("opened"),
         )
         for read in (load_plans, load_boundary_problems):
-            with pytest.raises(
-                DatasetError,
-                match=r"attribute 'problem' names .*, which is not in the folder of the file",
-            ):
+            with is_refused(DatasetError, argument="problem"):
                 read(path)
     assert load_plans(path, problem=PROBLEMS["heavy-object"]).problem == record_problem(
         PROBLEMS["heavy-object"]

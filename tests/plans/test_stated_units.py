@@ -13,6 +13,7 @@ from cnpgen.make.complete import read_tasks
 from cnpgen.plans.boundary_problems import load_boundary_problems
 from cnpgen.plans.plan_file import load_plans
 from cnpgen.store.field import Field
+from tests.refusals import is_refused
 
 Q = np.tile([0.0, 0.1, 0.0, -0.5, 0.0, 0.7], (2, 1))
 COLUMNS = {
@@ -55,7 +56,7 @@ def test_attributes_that_change_numbers_are_refused(
     name = next(iter(columns))
     with write(tmp_path / "a.h5", columns) as file:
         file[name].attrs[key] = value
-    with pytest.raises(DatasetError, match=f"the attribute '{key}' of {name} states"):
+    with is_refused(DatasetError):
         read(tmp_path / "a.h5")
 
 
@@ -81,7 +82,7 @@ def test_attributes_that_are_not_read_are_listed_or_refused(
     assert "not used: attribute rate, attribute epoch of start_q" in caplog.text
     with h5py.File(tmp_path / "a.h5", "a") as file:
         file.attrs["degre"] = 5
-    with pytest.raises(DatasetError, match="'degre' is almost 'degree'"):
+    with is_refused(DatasetError):
         read(tmp_path / "a.h5")
 
 

@@ -5,7 +5,6 @@ from pathlib import Path
 
 import casadi as ca
 import numpy as np
-import pytest
 import scipy
 
 from cnpgen.errors import RecipeError
@@ -21,6 +20,7 @@ from cnpgen.refine.solver.residuals import stage_jacobian, stage_values
 from cnpgen.world.world import World
 from tests.examples.jerk_limits import jerk_limited
 from tests.examples.plans import PROBLEMS
+from tests.refusals import is_refused
 
 JERK = JointJerk(tolerance=0.01)
 
@@ -46,14 +46,9 @@ def test_a_problem_gives_one_limit_for_all_joints_or_one_for_each(
     assert limits('"500 rad/s^3"') == [500.0] * 6
     assert limits("[1, 2, 3, 4, 5, 6]") == [1, 2, 3, 4, 5, 6]
     np.testing.assert_allclose(limits('"180 deg/s^3"'), np.pi)
-    with pytest.raises(
-        RecipeError,
-        match=r"limits\.jerk: needs one number, or 6, one per planned joint, got 2",
-    ):
+    with is_refused(RecipeError):
         limits("[1, 2]")
-    with pytest.raises(
-        RecipeError, match=r"limits\.jerk.*an angular jerk \[rad/s\^3\]"
-    ):
+    with is_refused(RecipeError):
         limits('"5 rad/s^2"')
 
 

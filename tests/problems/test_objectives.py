@@ -35,6 +35,7 @@ from tests.examples.installed import installed_kind
 from tests.examples.losses import PROBLEM_OF, batch
 from tests.examples.plans import PROBLEMS, load
 from tests.examples.refiner import transcription_of
+from tests.refusals import is_refused
 
 CURVE = ((0.5, -0.2, 0.2), (0.8, 0.0, 0.3), (0.9, 0.3, 0.1))
 TERMS: dict[str, ObjectiveTerm] = {
@@ -209,9 +210,7 @@ def test_terms_of_a_problem_file_are_read_and_recorded(tmp_path: Path):
     assert problem.objective.terms == (Centrifugal(weight=0.01), Effort(weight=0.5))
     with record_problem(problem).restored() as restored:
         assert restored.objective == problem.objective
-    with pytest.raises(
-        RecipeError, match=r"objective\.term 1\.points: expected at least 2 points"
-    ):
+    with is_refused(RecipeError):
         load_problem(
             _problem_file(
                 tmp_path,

@@ -28,6 +28,7 @@ from cnpgen.world.path import PathWorld
 from cnpgen.world.world import World
 from tests.conftest import some
 from tests.examples.shipped import PROBLEMS
+from tests.refusals import is_refused
 
 NAMES = "airhockey-tables", "heavy-object-loads"
 
@@ -200,7 +201,7 @@ def test_the_simulator_moves_the_table_of_each_plan() -> None:
         ),
     )
     assert all(result.plane_error > 5e-3 for result in simulate_plans(swapped).executed)
-    with pytest.raises(UsageError, match="the environment's table does not move"):
+    with is_refused(UsageError, argument="plans"):
         simulate_plans(plans, environment="clone")
 
 
@@ -340,17 +341,11 @@ def test_plans_need_parameters_of_their_problem() -> None:
 
 
 def test_values_are_checked_against_their_ranges() -> None:
-    with pytest.raises(
-        UsageError, match=r"payload_mass must be from 4 to 14, got 15 in row 1"
-    ):
+    with is_refused(UsageError, argument="parameters"):
         PROBLEMS["heavy-object-loads"].parameters.checked(np.array([[5.0], [15.0]]))
-    with pytest.raises(
-        UsageError, match=r"velocity_factor must be from 0\.5 to 1, got nan"
-    ):
+    with is_refused(UsageError, argument="parameters"):
         PROBLEMS["airhockey-tables"].parameters.checked(np.array([0, 0, 0, np.nan]))
-    with pytest.raises(
-        UsageError, match=r"shape \(N, 4\) for table_height, table_roll"
-    ):
+    with is_refused(UsageError, argument="parameters"):
         PROBLEMS["airhockey-tables"].parameters.checked(np.zeros((2, 3)))
 
 

@@ -21,6 +21,7 @@ from cnpgen.problems.problem_record import (
 from cnpgen.robots.robot_spec import Payload
 from cnpgen.robots.urdf_changes import PAYLOAD
 from tests.examples.shaped_robot import write_problem
+from tests.refusals import is_refused
 
 BODY = """
 [payload]
@@ -98,9 +99,7 @@ def test_a_changed_payload_of_a_stored_problem_changes_its_body(tmp_path):
         )
     (tmp_path / "crane" / "crane.urdf").write_text(problem.urdf_text)
     named = load_problem(tmp_path / "problem.toml")
-    with pytest.raises(
-        RecipeError, match="payload: the URDF has a link or joint 'carried payload'"
-    ):
+    with is_refused(RecipeError):
         load_robot(named)
 
 
@@ -112,10 +111,7 @@ def test_samples_of_a_body_keep_it_and_cannot_move_it(tmp_path):
     assert robot.chain.joints[-1].mass == pytest.approx(4.5)  # with hand and claw
     assert PAYLOAD in robot.shape.joints
     moved = ranges.replace("payload_mass = [1.0, 3.0]", "payload_x = [0.0, 0.2]")
-    with pytest.raises(
-        RecipeError,
-        match=r"payload_x moves the payload, whose body \('touch_links'\) cannot move",
-    ):
+    with is_refused(RecipeError):
         load_problem(with_payload(tmp_path / "moved", BODY + moved))
 
 
@@ -168,9 +164,7 @@ def test_a_body_needs_link_geometry(tmp_path):
         text.replace("[robot]", '[robot]\ngeometry = "paper-capsules"'),
         encoding="utf-8",
     )
-    with pytest.raises(
-        RecipeError, match=r"payload.touch_links: a payload is a body with geometry"
-    ):
+    with is_refused(RecipeError):
         load_problem(file)
 
 

@@ -29,6 +29,7 @@ from cnpgen.trajectory.boundary import Boundary
 from tests.conftest import some
 from tests.examples.shaped_robot import write_problem
 from tests.examples.shipped import PROBLEMS
+from tests.refusals import is_refused
 
 ROOT = Path(__file__).parents[2]
 
@@ -59,7 +60,7 @@ def test_the_digest_of_a_record_with_an_unknown_constraint_exists_and_the_record
     content["constraint"][1]["use"] = name
     changed = replace(record(), recipe=json.dumps(content))
     assert changed.comparable_sha256 != record().comparable_sha256
-    with pytest.raises(CnpgenError, match=f"constraint {name!r} is not installed"):
+    with is_refused(CnpgenError):
         as_problem(changed)
 
 
@@ -69,10 +70,7 @@ def test_a_problem_in_an_untrusted_file_reads_no_mesh_from_the_disk(
     problem = load_problem(write_problem(tmp_path))
     assert open_problem(record_problem(problem))[1].shape.convex_parts
     outside = problem.urdf_path.read_text()
-    with pytest.raises(
-        RecipeError,
-        match=r"names the mesh 'package://crane/.*', expected its corners in the text",
-    ):
+    with is_refused(RecipeError):
         open_problem(replace(record_problem(problem), urdf=outside))
 
 
@@ -112,24 +110,14 @@ def test_what_leads_to_no_problem_is_named(tmp_path: Path) -> None:
     dataset.write_text('name = "hit"\npipeline = "../pipelines/hit.toml"\n')
     assert as_problem(dataset).name == "airhockey"
     pipeline.write_text('problem = "airhokey"\n')
-    with pytest.raises(
-        RecipeError,
-        match=r"hit\.toml: problem: unknown problem 'airhokey' \(did you mean 'airhockey'",
-    ):
+    with is_refused(RecipeError):
         as_problem(dataset)
     dataset.write_text("pipeline = 3\n")
-    with pytest.raises(
-        RecipeError, match=r"hit\.toml: pipeline: expected a name or a path, got 3"
-    ):
+    with is_refused(RecipeError):
         as_problem(dataset)
-    with pytest.raises(
-        RecipeError,
-        match=r"unknown problem, pipeline or dataset 'airhokey-hit' .did you mean 'airho",
-    ):
+    with is_refused(RecipeError, argument="problem"):
         as_problem("airhokey-hit")
-    with pytest.raises(
-        RecipeError, match="'airhockey-hit': it is the name of a pipeline and a dataset"
-    ):
+    with is_refused(RecipeError, argument="name_or_path"):
         load_problem("airhockey-hit")
 
 
@@ -140,10 +128,7 @@ def test_what_is_no_problem_is_refused_in_few_words(wrong: object) -> None:
     if isinstance(wrong, list):
         wrong = [record()] * len(wrong)
     for use in (PlanLoss, BoundaryLayer, as_record):
-        with pytest.raises(
-            UsageError,
-            match="problem must be a Problem, a ProblemRecord, or the name or the",
-        ) as caught:
+        with is_refused(UsageError, argument="problem") as caught:
             use(wrong)  # type: ignore[operator]
         assert len(str(caught.value)) < 200
 

@@ -24,6 +24,7 @@ from cnpgen.world.measured_parameters import MeasuredParameters
 from cnpgen.world.path import PathWorld
 from cnpgen.world.world import World
 from tests.examples.shipped import PROBLEMS, ROBOTS
+from tests.refusals import is_refused
 
 
 @cache
@@ -170,9 +171,7 @@ def test_the_puck_follows_from_the_goal_and_is_out_of_reach_without_a_hit():
         scene.poses[0], [1.0, 0.1, 1.0 + 0.07 * 0.6, 0.1 - 0.07 * 0.8]
     )
     np.testing.assert_array_equal(scene.poses[1], PUCK_OUT_OF_REACH_M)
-    with pytest.raises(
-        UsageError, match="goal_velocity is missing: the problem 'airhockey' needs it"
-    ):
+    with is_refused(UsageError, argument="goal_velocity"):
         scene_of(PROBLEMS["airhockey"], goal, goal)
 
 

@@ -19,6 +19,7 @@ from cnpgen.refine.refine_plans import refine_plans, solve_plans
 from cnpgen.refine.solver import sqp
 from cnpgen.refine.task import Outcome
 from tests.conftest import some
+from tests.refusals import is_refused
 
 
 @pytest.fixture(scope="module")
@@ -125,7 +126,7 @@ def test_the_options_of_a_plan_contain_its_deadline_only_if_it_has_one(
 
 @pytest.mark.parametrize("value", [0, -1.0, float("nan"), "soon"])
 def test_an_invalid_deadline_is_refused(value):
-    with pytest.raises(UsageError, match="deadline must be"):
+    with is_refused(UsageError, argument="deadline"):
         RefineOptions(deadline=value)
 
 

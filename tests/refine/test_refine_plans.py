@@ -28,6 +28,7 @@ from cnpgen.refine.refine_plans import refine_plans, solve_plans
 from cnpgen.refine.task import Outcome
 from tests.conftest import HANGING, some
 from tests.examples.plan_files import remove_checksum
+from tests.refusals import is_refused
 
 N, HITS = 13, 16
 SOME_PLANS_BYTES = 6_000  # of a journal: some plans, but not all
@@ -63,7 +64,7 @@ def test_solving_ignores_existing_plans(problems: Plans, solved: Plans) -> None:
     slow = replace(solved, rate_control_points=0.5 * solved.rate_control_points)
     assert same(solve_plans(slow, workers=1).plans, solved)
     assert not same(refine_plans(slow, workers=1).plans, solved)
-    with pytest.raises(UsageError, match="problems must be Plans"):
+    with is_refused(UsageError, argument="problems"):
         solve_plans("airhockey-hit")  # type: ignore[arg-type]
 
 
@@ -218,25 +219,17 @@ def test_an_interrupted_run_resumes(
     )
     assert begun == [(N, 1)]
     assert same(found.plans, solved)
-    with pytest.raises(
-        UsageError,
-        match=r"another run \(options\.tolerance 0\.001, now 0\.002\): discard=True",
-    ):
+    with is_refused(UsageError, argument="discard"):
         refine_plans(
             problems, workers=1, journal=journal, options=RefineOptions(tolerance=2e-3)
         )
-    with pytest.raises(
-        UsageError,
-        match=r"another run \(options\.weight None, now 2\.0, other plans\): discard=True",
-    ):
+    with is_refused(UsageError, argument="discard"):
         refine_plans(
             solved, workers=1, journal=journal, options=RefineOptions(weight=2.0)
         )
     with monkeypatch.context() as patch:
         patch.setattr("cnpgen.refine.refine_plans.__version__", "99.0")
-        with pytest.raises(
-            UsageError, match=r"another run \(version .*, now 99\.0\): discard=True"
-        ):
+        with is_refused(UsageError, argument="discard"):
             refine_plans(problems, workers=1, journal=journal)
 
 
@@ -323,21 +316,17 @@ def test_drawn_problems_depend_on_the_seed_and_are_in_no_split(tmp_path: Path) -
     assert not np.isin(some.boundary.start_q[:, 0], train.boundary.start_q[:, 0]).any()
     rows = load_boundary_problems(made.folder, split="validation", start=1, n=2)
     assert rows.sample_id.tolist() == [1, 2]
-    with pytest.raises(
-        UsageError, match=r"no split 'trian' \(did you mean 'train'\?\), only train"
-    ):
+    with is_refused(UsageError, argument="split"):
         load_boundary_problems(made.folder, split="trian")
-    with pytest.raises(UsageError, match=r"has \d+ rows, got 1000 from row 0 on"):
+    with is_refused(UsageError, argument="n"):
         load_boundary_problems(made.folder, split="validation", n=1000)
-    with pytest.raises(UsageError, match="n must be an integer from 1 on, got 0"):
+    with is_refused(UsageError, argument="n"):
         draw_boundary_problems("airhockey-hit", 0)
-    with pytest.raises(UsageError, match=r"n must be an integer from 1 on, got 2\.5"):
+    with is_refused(UsageError, argument="n"):
         draw_boundary_problems("airhockey-replan", 2.5)  # type: ignore[arg-type]
-    with pytest.raises(UsageError, match="seed must be an integer from 0 to"):
+    with is_refused(UsageError, argument="seed"):
         draw_boundary_problems("airhockey-replan", 1, seed=-1)
-    with pytest.raises(
-        UsageError, match=r"start must be an integer from 0 on, got 1\.0"
-    ):
+    with is_refused(UsageError, argument="start"):
         load_boundary_problems(made.folder, start=1.0)  # type: ignore[arg-type]
 
 

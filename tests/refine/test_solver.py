@@ -68,6 +68,7 @@ from tests.examples.refiner import (
     task,
     verdict,
 )
+from tests.refusals import is_refused
 
 LABELS = ("hit", "replan", "transport")
 
@@ -212,17 +213,13 @@ def test_objectives_are_chosen_by_name_and_invalid_options_are_refused() -> None
     assert choose_cost_term(problem, "time", 0.0) is None
     assert choose_cost_term(PROBLEMS["heavy-object"]) is None
     assert choose_cost_term(problem, "jerk", 0.2) == cost_term_of("jerk", 0.2)
-    with pytest.raises(UsageError, match=r"objective 'tiem' .*did you mean 'time'"):
+    with is_refused(UsageError, argument="objective"):
         RefineOptions(objective="tiem")
-    with pytest.raises(UsageError, match="weight must not be negative, got -1"):
+    with is_refused(UsageError, argument="weight"):
         RefineOptions(objective="effort", weight=-1.0)
-    with pytest.raises(
-        UsageError, match="tolerance must be above 0 and below 1, got 0"
-    ):
+    with is_refused(UsageError, argument="tolerance"):
         RefineOptions(tolerance=0)
-    with pytest.raises(
-        UsageError, match=r"max_iterations must be an integer, got 2\.5"
-    ):
+    with is_refused(UsageError, argument="max_iterations"):
         RefineOptions(max_iterations=2.5)  # type: ignore[arg-type]
 
 

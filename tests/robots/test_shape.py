@@ -38,6 +38,7 @@ from tests.examples.shaped_robot import (
     write_crane,
     write_problem,
 )
+from tests.refusals import is_refused
 
 DAE = """<?xml version="1.0"?>
 <COLLADA xmlns="http://www.collada.org/2005/11/COLLADASchema" version="1.4.1">
@@ -123,7 +124,7 @@ def test_addresses_of_files_and_relative_paths_are_read_and_others_refused(tmp_p
     (tmp_path / "a.stl").touch()
     for name in ("a.stl", f"file://{tmp_path}/a.stl", str(tmp_path / "a.stl")):
         assert find_named_file(name, tmp_path / "arm.urdf") == tmp_path / "a.stl"
-    with pytest.raises(RecipeError, match="address is not read"):
+    with is_refused(RecipeError):
         find_named_file("https://example.org/a.stl", tmp_path / "arm.urdf")
 
 
@@ -281,9 +282,7 @@ def test_flat_meshes_and_units_of_dae_files_are_reported(tmp_path):
 def test_corners_that_a_stranger_wrote_into_a_text_are_those_of_a_body(corners, text):
     content = base64.b64encode(np.array(corners, "<f8").tobytes()).decode()
     mesh = f'<geometry><mesh filename="data:application/octet-stream;base64,{content}"/></geometry>'
-    with pytest.raises(
-        RecipeError, match="the collision geometry of link 'hand' cannot be read"
-    ) as caught:
+    with is_refused(RecipeError) as caught:
         link_convex_parts(urdf({**LINKS, "hand": [mesh], "fore": [], "claw": []}))
     assert text in str(caught.value)
 
@@ -315,9 +314,7 @@ def test_corners_that_a_stranger_wrote_into_a_text_are_those_of_a_body(corners, 
     ],
 )
 def test_what_cannot_be_read_is_named_with_its_link(element, text):
-    with pytest.raises(
-        RecipeError, match="the collision geometry of link 'hand' cannot be read"
-    ) as caught:
+    with is_refused(RecipeError) as caught:
         link_convex_parts(urdf({**LINKS, "hand": [element], "fore": [], "claw": []}))
     assert text in str(caught.value)
 
@@ -498,7 +495,7 @@ def test_links_of_an_srdf_that_the_urdf_lacks_are_a_warning(tmp_path, caplog):
     text = with_disabled_pairs(urdf(), srdf)
     assert disabled_pairs(text) == {frozenset(("base", "hand"))}
     assert "names 2 links that the URDF lacks: foot, toe" in caplog.text
-    with pytest.raises(RecipeError, match="the URDF has no link foot"):
+    with is_refused(RecipeError):
         with_ignored_pairs(text, [("hand", "foot")])
 
 
@@ -541,7 +538,5 @@ def test_elements_of_an_srdf_that_change_nothing_are_listed(tmp_path, caplog):
 
 def test_a_robot_without_collision_geometry_has_no_shape(tmp_path):
     file = write_crane(tmp_path, {link: [] for link in LINKS})
-    with pytest.raises(
-        RecipeError, match="no link that moves has a <collision> element"
-    ):
+    with is_refused(RecipeError):
         load(file, tmp_path)

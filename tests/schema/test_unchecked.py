@@ -1,10 +1,10 @@
 """Objects of known values, built without their checks."""
 
 import numpy as np
-import pytest
 
 from cnpgen.schema.unchecked import unchecked
 from cnpgen.trajectory.spline_motion import Motion
+from tests.refusals import is_refused
 
 
 def test_an_unchecked_object_equals_a_checked_one():
@@ -15,5 +15,5 @@ def test_an_unchecked_object_equals_a_checked_one():
 
 
 def test_every_field_needs_a_value():
-    with pytest.raises(ValueError, match="shorter"):
+    with is_refused(ValueError):
         unchecked(Motion, np.zeros((1, 9, 2)))

@@ -14,6 +14,7 @@ from cnpgen.store.files import cache_entry
 from cnpgen.store.files.archives import ArchiveError, read_arrays
 from cnpgen.store.files.cache_entry import read_entry, write_entry
 from tests.conftest import some
+from tests.refusals import is_refused
 
 
 def archive(*, compressed: bool = False, **arrays: np.ndarray) -> bytes:
@@ -63,9 +64,9 @@ def test_a_damaged_archive_gives_one_error_or_the_arrays(seed: int) -> None:
 def test_sizes_are_compared_before_the_arrays_are_read() -> None:
     bomb = archive(compressed=True, q=np.zeros(30_000_000))
     assert len(bomb) < 1 << 19
-    with pytest.raises(ArchiveError, match="holds 240,000,128 bytes, expected at most"):
+    with is_refused(ArchiveError):
         read_arrays(bomb, max_bytes=1 << 20)
-    with pytest.raises(ArchiveError, match="its arrays are compressed"):
+    with is_refused(ArchiveError):
         read_arrays(bomb, max_bytes=1 << 30, stored=True)
     buffer, header = io.BytesIO(), io.BytesIO()
     np.lib.format.write_array_header_1_0(
@@ -73,7 +74,7 @@ def test_sizes_are_compared_before_the_arrays_are_read() -> None:
     )
     with zipfile.ZipFile(buffer, "w") as file:
         file.writestr("q.npy", header.getvalue() + bytes(80))
-    with pytest.raises(ArchiveError, match="states 1,000,000,000,000 values"):
+    with is_refused(ArchiveError):
         read_arrays(buffer.getvalue(), max_bytes=1 << 20)
 
 
@@ -88,7 +89,7 @@ def test_foreign_content_is_refused(content: bytes) -> None:
 def test_objects_are_refused() -> None:
     buffer = io.BytesIO()
     np.savez(buffer, q=np.array([{}], object))
-    with pytest.raises(ArchiveError, match=r"'q\.npy' states 1 values of object"):
+    with is_refused(ArchiveError):
         read_arrays(buffer.getvalue(), max_bytes=1000_000)
 
 
@@ -136,6 +137,6 @@ def test_a_full_disk_is_named_and_no_error(
 def test_arrays_are_counted_as_floats_before_they_are_read() -> None:
     content = archive(compressed=True, q=np.zeros(1_000_000, np.int8))
     assert len(content) < 10_000
-    with pytest.raises(ArchiveError, match="it holds 8,000,000 bytes, expected at"):
+    with is_refused(ArchiveError):
         read_arrays(content, max_bytes=7_999_999)
     assert read_arrays(content, max_bytes=8_000_000)["q"].shape == (1_000_000,)

@@ -17,6 +17,7 @@ from cnpgen.store.inspection import inspect_dataset
 from cnpgen.store.reader import open_dataset
 from tests.examples.documents import rewritten
 from tests.examples.store import SPEC, dataset  # noqa: F401 - a fixture
+from tests.refusals import is_refused
 
 Change = Callable[[dict[str, Any]], None]
 
@@ -59,10 +60,7 @@ def test_a_manifest_with_other_files_than_the_shards_is_refused(
 ) -> None:
     rewritten(dataset / "manifest.json", change)
     for read in (open_dataset, load_dataset):
-        with pytest.raises(
-            DatasetError,
-            match=r"manifest\.json lists other shards than specification\.json",
-        ):
+        with is_refused(DatasetError):
             read(dataset)
     assert "lists other shards than specification.json" in {
         finding.problem for finding in check_dataset(dataset)
@@ -93,10 +91,7 @@ def test_a_link_out_of_the_folder_is_not_followed(
             lambda: load_dataset(dataset).arrays("train"),
             lambda: open_dataset(dataset).read("train"),
         ):
-            with pytest.raises(
-                DatasetError,
-                match="is a link that leads outside the folder of the dataset",
-            ):
+            with is_refused(DatasetError):
                 read()
 
 
@@ -147,7 +142,7 @@ def test_an_impossible_specification_is_refused_at_once(
     rewritten(dataset / "specification.json", change)
     begun = time.process_time()
     for read in (load_dataset_spec, open_dataset, load_dataset, inspect_dataset):
-        with pytest.raises(DatasetError, match=r"specification\.json is damaged: "):
+        with is_refused(DatasetError):
             read(dataset)
     assert [finding.file for finding in check_dataset(dataset)] == [
         "specification.json"
@@ -156,10 +151,7 @@ def test_an_impossible_specification_is_refused_at_once(
 
 
 def test_too_many_shards_are_refused() -> None:
-    with pytest.raises(
-        UsageError,
-        match=r"^1,000,000,000 shards of 1 rows are too many, .* a larger shard_size=$",
-    ):
+    with is_refused(UsageError, argument="shard_size"):
         replace(SPEC, splits={"train": 10**9}, shard_size=1)
 
 
@@ -193,7 +185,7 @@ def other_field(part: dict[str, Any]) -> None:
 )
 def test_statistics_of_other_fields_are_refused(dataset: Path, change: Change) -> None:  # noqa: F811
     rewritten(dataset / "stats.json", lambda stats: change(stats["splits"]["train"]))
-    with pytest.raises(DatasetError, match=rf"stats\.json.*({STATISTICS})"):
+    with is_refused(DatasetError):
         load_dataset(dataset)
     task = shards(SPEC)[0]
     rewritten(dataset / task.sidecar, lambda record: change(record["statistics"]))
@@ -208,5 +200,5 @@ def test_a_forged_fingerprint_is_detected(dataset: Path) -> None:  # noqa: F811
         dataset / "specification.json",
         lambda specification: specification.update(forged),
     )
-    with pytest.raises(CnpgenError, match="fingerprint does not match"):
+    with is_refused(CnpgenError):
         load_dataset_spec(dataset)

@@ -26,6 +26,7 @@ from cnpgen.store.files.documents import (
     save_document,
 )
 from cnpgen.store.files.size_limits import MAX_DOCUMENT_BYTES, MAX_DOCUMENT_DEPTH
+from tests.refusals import is_refused
 
 DOCUMENT = {
     "format": "test",
@@ -73,7 +74,7 @@ def test_numpy_values_become_plain_and_infinities_become_readable_strings() -> N
         "5": "x",
     }
     assert float(value["c"][1]) == -np.inf
-    with pytest.raises(TypeError, match="set"):
+    with is_refused(TypeError):
         plain({"a": {1}})
 
 
@@ -131,10 +132,10 @@ def test_other_formats_and_versions_are_refused_and_named(
 
 
 def test_missing_and_foreign_files_are_refused(tmp_path: Path) -> None:
-    with pytest.raises(DatasetError, match="missing"):
+    with is_refused(DatasetError):
         load_document(tmp_path / "a.json", "test", version=1, structure={})
     (tmp_path / "a.json").write_text("[1]")
-    with pytest.raises(DatasetError, match="JSON object"):
+    with is_refused(DatasetError):
         load_document(tmp_path / "a.json", "test", version=1, structure={})
 
 
@@ -185,9 +186,9 @@ def test_a_document_with_the_expected_structure_is_accepted() -> None:
     )
     check_structure({"a": "inf", "b": -1, "c": 1e300}, {ANY_KEY: NUMBER})
     for wrong in (-1, 2**63, 1.0, "1", None, True):
-        with pytest.raises(ValueError, match=r"^a must be a whole number"):
+        with is_refused(ValueError):
             check_structure({"a": wrong}, {"a": WHOLE})
-    with pytest.raises(ValueError, match=r"^a must be a number, got -1000"):
+    with is_refused(ValueError):
         check_structure({"a": -(10**400)}, {"a": NUMBER})
 
 
@@ -210,7 +211,7 @@ def test_invalid_json_is_refused(tmp_path: Path, text: str, message: str) -> Non
     with pytest.raises(ValueError, match=message):
         parse_json(text)
     (tmp_path / "a.json").write_text(text)
-    with pytest.raises(DatasetError, match=r"a\.json is damaged: not JSON"):
+    with is_refused(DatasetError):
         load_document(tmp_path / "a.json", "test", version=1, structure={})
 
 
@@ -223,14 +224,12 @@ def test_json_of_the_maximum_depth_is_read() -> None:
 def test_a_document_that_is_too_large_is_not_read(tmp_path: Path) -> None:
     with (tmp_path / "a.json").open("wb") as file:
         file.truncate(MAX_DOCUMENT_BYTES + 1)
-    with pytest.raises(
-        DatasetError, match=r"a\.json has 33,554,433 bytes, expected at most 33,554,432"
-    ):
+    with is_refused(DatasetError):
         load_document(tmp_path / "a.json", "test", version=1, structure={})
 
 
 def test_devices_and_pipes_are_refused_without_blocking(tmp_path: Path) -> None:
     os.mkfifo(tmp_path / "a.json")
     for path in (Path("/dev/zero"), tmp_path / "a.json"):
-        with pytest.raises(DatasetError, match="is not a file"):
+        with is_refused(DatasetError):
             load_document(path, "test", version=1, structure={})

@@ -22,6 +22,7 @@ from cnpgen.store.files.hdf5 import open_hdf5
 from cnpgen.store.files.size_limits import MAX_EXPANSION, MIN_EXPANSION_LIMIT_BYTES
 from cnpgen.store.shard import read_placements, read_shard
 from tests.plans.test_plans import write_minimal
+from tests.refusals import is_refused
 
 Change = Callable[[Any, Path], None]
 SECRET = "the private key of a user"
@@ -163,7 +164,7 @@ def test_datasets_that_are_not_read_are_not_checked(tmp_path: Path) -> None:
         assert "note" in file
         assert file["start_q"].read().shape == (3, 6)
         assert "group" not in set(file)
-        with pytest.raises(DatasetError, match="group must be a dataset, got a group"):
+        with is_refused(DatasetError):
             file["group"]
 
 
@@ -193,7 +194,7 @@ def test_the_size_limit_applies_to_all_datasets_together(tmp_path: Path) -> None
     assert MAX_EXPANSION * path.stat().st_size < MIN_EXPANSION_LIMIT_BYTES
     with open_hdf5(path) as file:
         assert len({name: file[name] for name in ("note0", "note1", "note2")}) == 3
-        with pytest.raises(DatasetError, match="note3 declares"):
+        with is_refused(DatasetError):
             file["note3"]
 
 
@@ -208,10 +209,7 @@ def test_attributes_other_than_texts_and_numbers_are_refused(
     path = write_minimal(tmp_path / "theirs.h5")
     with h5py.File(path, "a") as file:
         file.attrs["degree"] = value
-    with pytest.raises(
-        DatasetError,
-        match="the attribute 'degree' must be a text, a number or a list of numbers",
-    ):
+    with is_refused(DatasetError):
         load_plans(path)
 
 
@@ -221,13 +219,13 @@ def test_a_name_that_is_not_utf8_is_damage(tmp_path: Path) -> None:
         h5py.h5d.create(
             file.id, b"\xff", h5py.h5t.NATIVE_DOUBLE, h5py.h5s.create_simple((3,))
         )
-    with pytest.raises(DatasetError, match="which is not UTF-8"):
+    with is_refused(DatasetError):
         load_plans(path)
 
 
 def test_a_device_is_not_a_file() -> None:
     with (
-        pytest.raises(DatasetError, match="/dev/zero is not a file"),
+        is_refused(DatasetError),
         open_hdf5(Path("/dev/zero")),
     ):
         pass
@@ -253,9 +251,7 @@ def test_a_huge_sparse_file_is_refused(tmp_path: Path) -> None:
         ),
     ):
         os.truncate(path, 1 << 40)
-        with pytest.raises(
-            DatasetError, match=r"has 1,099,511,627,776 bytes, expected at most"
-        ):
+        with is_refused(DatasetError):
             read(path)
 
 
@@ -267,7 +263,7 @@ def test_heaps_at_the_end_of_a_file_are_checked(
     content[content.index(b"GCOL\x01\0\0\0") + 9] ^= 0x20
     path.write_bytes(content)
     monkeypatch.setattr("cnpgen.store.files.heaps._CHUNK_BYTES", 56)
-    with pytest.raises(DatasetError, match="its texts at byte"), open_hdf5(path):
+    with is_refused(DatasetError), open_hdf5(path):
         pass
 
 

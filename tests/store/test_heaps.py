@@ -11,6 +11,7 @@ from cnpgen.plans import load_plans
 from cnpgen.store.files.hdf5 import open_hdf5
 from cnpgen.store.files.heaps import check_heaps
 from tests.plans.test_plans import write_minimal
+from tests.refusals import is_refused
 
 
 @pytest.fixture
@@ -43,16 +44,13 @@ def test_a_heap_with_inconsistent_sizes_is_damage(
 ) -> None:
     path, begin = file
     changed(path, begin + offset, size)
-    with pytest.raises(
-        DatasetError,
-        match=rf"theirs\.h5 is damaged: its texts at byte {begin} cannot be read",
-    ):
+    with is_refused(DatasetError):
         load_plans(path)
 
 
 def test_a_heap_that_is_cut_off_is_damage(file: tuple[Path, int]) -> None:
     path, begin = file
-    with pytest.raises(DatasetError, match="its texts at byte 0 cannot be read"):
+    with is_refused(DatasetError):
         check_heaps(path, io.BytesIO(path.read_bytes()[begin : begin + 8]))
 
 
@@ -66,7 +64,7 @@ def test_numbers_that_look_like_a_heap_are_numbers(tmp_path: Path) -> None:
 def test_an_empty_file_is_refused(tmp_path: Path) -> None:
     (tmp_path / "empty.h5").touch()
     with (
-        pytest.raises(DatasetError, match="it is empty"),
+        is_refused(DatasetError),
         open_hdf5(tmp_path / "empty.h5"),
     ):
         pass

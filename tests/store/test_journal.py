@@ -7,6 +7,7 @@ import pytest
 
 from cnpgen.errors import DatasetError, MachineError, UsageError
 from cnpgen.store.files.journal import open_journal_file
+from tests.refusals import is_refused
 
 MAGIC = b"cnpgen test-journal 1\n"
 RECORDS = [b"identity", b"", bytes(range(256))]
@@ -74,9 +75,7 @@ def test_a_cleared_journal_has_no_records(tmp_path: Path) -> None:
 def test_files_of_other_formats_are_refused_and_unchanged(tmp_path: Path) -> None:
     path = tmp_path / "journal"
     path.write_bytes(b"thesis")
-    with pytest.raises(
-        DatasetError, match="journal does not start with b'cnpgen test-journal"
-    ):
+    with is_refused(DatasetError):
         open_journal_file(path, MAGIC)
     assert path.read_bytes() == b"thesis"
 
@@ -84,7 +83,7 @@ def test_files_of_other_formats_are_refused_and_unchanged(tmp_path: Path) -> Non
 @pytest.mark.skipif(os.name == "nt", reason="needs flock")
 def test_a_journal_in_use_is_refused(tmp_path: Path) -> None:
     journal = open_journal_file(tmp_path / "journal", MAGIC)
-    with pytest.raises(UsageError, match="is in use by another process"):
+    with is_refused(UsageError):
         open_journal_file(tmp_path / "journal", MAGIC)
     journal.close()
     assert reopened(tmp_path / "journal") == []
@@ -98,11 +97,9 @@ def test_a_full_disk_is_a_machine_error_and_the_record_is_not_kept(
 
     journal = open_journal_file(tmp_path / "journal", MAGIC)
     monkeypatch.setattr(os, "fsync", full)
-    with pytest.raises(
-        MachineError, match=r"cannot write .*journal: No space left on device"
-    ):
+    with is_refused(MachineError):
         journal.append(b"record")
     assert journal.records == []
     journal.close()
-    with pytest.raises(MachineError, match="cannot write"):
+    with is_refused(MachineError):
         open_journal_file(tmp_path / "no" / "journal", MAGIC)

@@ -13,6 +13,7 @@ from cnpgen.make.merge import merge_datasets
 from cnpgen.store.layout import DOCUMENTS, WORK
 from cnpgen.validate.validate_dataset import validate_dataset
 from tests.conftest import tiny_recipe
+from tests.refusals import is_refused
 
 SHARD = "train/shard-00001.h5"
 FILES = (*DOCUMENTS, SHARD, "train/shard-00001.json", "train", WORK)
@@ -47,9 +48,7 @@ def test_merge_refuses_a_link_out_of_a_part(
     tiny: Callable[[str], Path], damaged: Path, tmp_path: Path, name: str
 ) -> None:
     linked(damaged, name, tmp_path / "outside")
-    with pytest.raises(
-        DatasetError, match=r"leads outside the folder of the dataset; .*cp -rL"
-    ):
+    with is_refused(DatasetError):
         merge_datasets([damaged], tmp_path / "out")
     assert not list((tmp_path / "out").glob("train/*.h5"))
 
@@ -66,7 +65,7 @@ def test_no_dataset_is_made_through_a_link(
             tiny_recipe("airhockey-hit"), damaged, shard_size=250, workers=1
         ),
     ):
-        with pytest.raises(UsageError, match="leads outside the folder of the dataset"):
+        with is_refused(UsageError):
             make()
     assert sorted(path.name for path in tmp_path.rglob("*")) == before
 

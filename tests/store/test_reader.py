@@ -17,6 +17,7 @@ from cnpgen.store.dataset_spec import shards, write_dataset_spec
 from cnpgen.store.files.atomic import file_sha256
 from cnpgen.store.reader import open_dataset
 from tests.examples.store import SPEC, dataset, make_columns, make_shard
+from tests.refusals import is_refused
 
 __all__ = ["dataset"]
 
@@ -62,7 +63,7 @@ def test_shards_are_listed_and_read_by_a_copy(dataset: Path) -> None:
 def test_rows_that_do_not_exist_are_refused(
     dataset: Path, start: int, stop: int
 ) -> None:
-    with pytest.raises(DatasetError, match="rows 0 to 50"):
+    with is_refused(DatasetError):
         open_dataset(dataset).read("train", start=start, stop=stop)
 
 
@@ -72,17 +73,14 @@ def test_unknown_splits_and_fields_are_refused(dataset: Path) -> None:
         message = rf"has no split '{split}' \(did you mean 'validation'\?\), only train, validation$"
         with pytest.raises(DatasetError, match=message):
             opened.read(split)
-    with pytest.raises(DatasetError, match="did you mean 'start_q'"):
+    with is_refused(DatasetError, argument="fields"):
         opened.read("train", fields=["start_dq"])
 
 
 def test_unfinished_datasets_are_refused_unless_allowed(tmp_path: Path) -> None:
     write_dataset_spec(tmp_path, SPEC)
     make_shard(tmp_path, SPEC, shards(SPEC)[1])
-    with pytest.raises(
-        DatasetError,
-        match="unfinished: 1 of 3 shards are finished; run make_dataset or",
-    ):
+    with is_refused(DatasetError):
         open_dataset(tmp_path)
     opened = open_dataset(tmp_path, allow_incomplete=True)
     assert opened.manifest is None
@@ -93,13 +91,10 @@ def test_unfinished_datasets_are_refused_unless_allowed(tmp_path: Path) -> None:
 def test_damaged_parts_are_refused(dataset: Path) -> None:
     path = dataset / shards(SPEC)[0].file
     path.write_bytes(path.read_bytes()[:-1])
-    with pytest.raises(
-        DatasetError,
-        match=r"shard-00000\.h5 has \d+ bytes instead of \d+; run make_dataset or",
-    ):
+    with is_refused(DatasetError):
         open_dataset(dataset).read("train")
     (dataset / "manifest.json").write_text("{")
-    with pytest.raises(DatasetError, match=r"manifest\.json is damaged"):
+    with is_refused(DatasetError):
         open_dataset(dataset)
 
 
@@ -152,7 +147,7 @@ def test_a_shard_is_hashed_once_unless_it_changes(
     path = dataset / shards(SPEC)[0].file
     change_a_number(path)
     os.utime(path, ns=(0, 0))
-    with pytest.raises(DatasetError, match="sha256"):
+    with is_refused(DatasetError):
         open_dataset(dataset).read("train", stop=1)
     assert hashed == ["shard-00000.h5"] * 2
 
@@ -166,7 +161,7 @@ def test_a_folder_that_mixes_two_datasets_is_refused(
     (dataset / "specification.json").write_bytes(
         (tmp_path / "other" / "specification.json").read_bytes()
     )
-    with pytest.raises(DatasetError, match="mixes two datasets"):
+    with is_refused(DatasetError):
         open_dataset(dataset)
 
 

@@ -38,6 +38,7 @@ from tests.examples.store import (
     make_shard,
     make_shards,
 )
+from tests.refusals import is_refused
 
 TASK = shards(SPEC)[0]
 
@@ -89,7 +90,7 @@ def test_the_shard_is_there_before_its_sidecar(
         sync(descriptor)
 
     monkeypatch.setattr(os, "fsync", full)
-    with pytest.raises(MachineError, match=r"shard-00000\.json"):
+    with is_refused(MachineError):
         make_shard(tmp_path, SPEC, TASK)
     assert [path.name for path in (tmp_path / "train").iterdir()] == ["shard-00000.h5"]
     assert not is_committed(tmp_path, SPEC, TASK)
@@ -97,7 +98,7 @@ def test_the_shard_is_there_before_its_sidecar(
 
 def test_unusable_columns_leave_neither_shard_nor_sidecar(tmp_path: Path) -> None:
     columns = make_columns(TASK) | {"clearance": np.full(32, np.nan)}
-    with pytest.raises(DatasetError, match="not finite"):
+    with is_refused(DatasetError):
         commit_shard(
             tmp_path, SPEC, TASK, columns=columns, sampling=make_sampling(TASK)
         )
@@ -152,7 +153,7 @@ def test_a_changed_digit_in_a_sidecar_is_detected(tmp_path: Path) -> None:
     make_shard(tmp_path, SPEC, TASK)
     path = tmp_path / TASK.sidecar
     path.write_bytes(path.read_bytes().replace(b'"tried": 64', b'"tried": 65'))
-    with pytest.raises(DatasetError, match="changed after it was written"):
+    with is_refused(DatasetError):
         load_record(tmp_path, TASK)
 
 
@@ -161,7 +162,7 @@ def test_missing_shards_and_shards_of_another_specification_are_not_committed(
 ) -> None:
     assert not is_committed(tmp_path, SPEC, TASK)
     make_shard(tmp_path, SPEC, TASK)
-    with pytest.raises(DatasetError, match="another specification"):
+    with is_refused(DatasetError):
         load_committed(tmp_path, replace(SPEC, seed=1), TASK)
     (tmp_path / TASK.file).unlink()
     assert not is_committed(tmp_path, SPEC, TASK)
@@ -170,9 +171,7 @@ def test_missing_shards_and_shards_of_another_specification_are_not_committed(
 def test_a_sidecar_of_another_shard_is_refused(tmp_path: Path) -> None:
     make_shards(tmp_path)
     (tmp_path / shards(SPEC)[1].sidecar).replace(tmp_path / TASK.sidecar)
-    with pytest.raises(
-        DatasetError, match="record of another shard: train/shard-00001"
-    ):
+    with is_refused(DatasetError):
         load_record(tmp_path, TASK)
 
 
@@ -185,7 +184,7 @@ def test_a_sidecar_without_its_keys_is_refused(tmp_path: Path) -> None:
                 lambda _, c=change: record_to_json(record) | c,
             )
             save_record(tmp_path, TASK, record)
-        with pytest.raises(DatasetError, match="damaged"):
+        with is_refused(DatasetError):
             load_record(tmp_path, TASK)
 
 
@@ -241,16 +240,14 @@ def test_merged_sampling_statistics_have_summed_counts_the_worst_violation_and_t
 
 
 def test_inconsistent_counts_and_non_finite_violations_are_refused() -> None:
-    with pytest.raises(
-        DatasetError, match="5 candidates, but 2 accepted and 2 rejected"
-    ):
+    with is_refused(DatasetError):
         SamplingStatistics(tried=5, accepted=2, rejections={"a": 2})
-    with pytest.raises(DatasetError, match="'plane' must be a finite number, got nan"):
+    with is_refused(DatasetError):
         SamplingStatistics(tried=1, accepted=1, verification={"plane": float("nan")})
 
 
 def test_density_maps_of_different_grids_are_not_merged() -> None:
     counts = np.zeros((2, 2), np.int64)
     a, b = (DensityMap((0.0, high), (0.0, 1.0), counts, counts) for high in (1.0, 2.0))
-    with pytest.raises(DatasetError, match="different grids"):
+    with is_refused(DatasetError):
         a.merge(b)

@@ -20,6 +20,7 @@ from cnpgen.store.statistics import (
     statistics_from_json,
 )
 from tests.examples.store import FIELDS, SPEC, make_columns
+from tests.refusals import is_refused
 
 FIELD = Field(
     "q",
@@ -119,7 +120,7 @@ def test_fields_without_finite_limits_have_no_histogram(field: Field) -> None:
 
 
 def test_limits_of_another_width_are_refused() -> None:
-    with pytest.raises(DatasetError, match="4 limits"):
+    with is_refused(DatasetError):
         field_statistics(values(10), replace(FIELD, valid_min=(0.0,)))
 
 
@@ -148,9 +149,9 @@ def test_statistics_of_different_fields_are_not_merged() -> None:
         field_statistics(values(10), replace(FIELD, valid_min=(-4.0,) * 4)),
     ]
     for other in others:
-        with pytest.raises(DatasetError, match="different fields"):
+        with is_refused(DatasetError):
             a.merge(other)
-    with pytest.raises(DatasetError, match="different fields"):
+    with is_refused(DatasetError):
         merge_statistics([{"q": a}, {"p": a}])
-    with pytest.raises(DatasetError, match="no statistics"):
+    with is_refused(DatasetError):
         merge_statistics([])

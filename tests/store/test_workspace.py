@@ -3,8 +3,6 @@
 from dataclasses import replace
 from pathlib import Path
 
-import pytest
-
 from cnpgen.errors import DatasetError, UsageError
 from cnpgen.store.dataset_spec import load_dataset_spec, shards, write_dataset_spec
 from cnpgen.store.workspace import (
@@ -17,6 +15,7 @@ from cnpgen.store.workspace import (
     started_spec,
 )
 from tests.examples.store import SPEC, make_shard
+from tests.refusals import is_refused
 
 OTHER = replace(SPEC, seed=8)
 
@@ -51,7 +50,7 @@ def test_a_dataset_with_a_damaged_specification_is_recognized_as_a_dataset(
     found = find_workspace(tmp_path)
     assert (found.content, found.has_shards, found.spec) == ("a dataset", True, None)
     assert "specification.json is damaged" in found.damage
-    with pytest.raises(DatasetError, match=r"damaged.*force=True replaces"):
+    with is_refused(DatasetError, argument="force"):
         started_spec(found, SPEC)
     assert check_clearable(found) == [tmp_path / "train"]
 
@@ -70,10 +69,7 @@ def test_a_dataset_of_an_older_format_is_recognized_and_can_be_replaced(
         True,
         None,
     )
-    with pytest.raises(
-        DatasetError,
-        match=r"plan\.json has format version 2, .*force=True replaces the whole dataset",
-    ):
+    with is_refused(DatasetError, argument="force"):
         open_workspace(tmp_path, SPEC)
     assert open_workspace(tmp_path, SPEC, force=True) == SPEC
     assert {path.name for path in tmp_path.iterdir()} - {"_work"} == {
@@ -96,10 +92,7 @@ def test_a_specification_replaces_another_one_only_if_there_are_no_rows(
     open_workspace(tmp_path, SPEC)
     assert open_workspace(tmp_path, OTHER) == OTHER
     make_shard(tmp_path, OTHER, shards(OTHER)[0])
-    with pytest.raises(
-        UsageError,
-        match=r"holds another dataset \(seed 8 instead of \d+\); choose another out=",
-    ):
+    with is_refused(UsageError, argument="out"):
         open_workspace(tmp_path, SPEC)
     assert load_dataset_spec(tmp_path) == OTHER
     assert open_workspace(tmp_path, SPEC, force=True) == SPEC
@@ -117,10 +110,7 @@ def test_a_specification_with_several_different_settings_is_refused_and_each_is_
         robot={"name": "another", "joint_names": []},
         fields=SPEC.fields[:2],
     )
-    with pytest.raises(
-        UsageError,
-        match=r"\(dtype float64 instead of float32; another robot; another fields\)",
-    ):
+    with is_refused(UsageError, argument="out"):
         open_workspace(tmp_path, other)
 
 
@@ -130,14 +120,14 @@ def test_a_dataset_started_by_another_process_after_the_first_check_is_detected(
     check_place(find_workspace(tmp_path))
     write_dataset_spec(tmp_path, OTHER)
     make_shard(tmp_path, OTHER, shards(OTHER)[0])
-    with pytest.raises(UsageError, match="holds another dataset"):
+    with is_refused(UsageError, argument="out"):
         open_workspace(tmp_path, SPEC)
 
 
 def test_a_folder_with_other_files_is_refused(tmp_path: Path) -> None:
     (tmp_path / "thesis.tex").write_text("mine")
     for force in (False, True):
-        with pytest.raises(UsageError, match="not empty and not a dataset of cnpgen"):
+        with is_refused(UsageError, argument="out"):
             open_workspace(tmp_path, SPEC, force=force)
     assert [path.name for path in tmp_path.iterdir()] == ["thesis.tex"]
 
@@ -148,5 +138,5 @@ def test_a_specification_replaced_by_another_process_is_detected(
     open_workspace(tmp_path, SPEC)
     require_dataset_spec(tmp_path, SPEC)
     open_workspace(tmp_path, OTHER)
-    with pytest.raises(UsageError, match="was replaced by another dataset"):
+    with is_refused(UsageError, argument="out"):
         require_dataset_spec(tmp_path, SPEC)

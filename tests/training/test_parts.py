@@ -3,6 +3,7 @@
 import math
 from types import SimpleNamespace
 from typing import Any
+from unittest.mock import ANY
 
 import numpy as np
 import pytest
@@ -22,6 +23,7 @@ from cnpgen.training.prepare import begin_run
 from cnpgen.training.settings import METRICS, Length, TrainingSettings
 from cnpgen.training.training_rows import StepRows
 from tests.examples.constraints import TipSpeed
+from tests.refusals import is_refused
 
 
 def rate(step: int) -> float:
@@ -112,12 +114,12 @@ WRONG: list[tuple[str, Any]] = [
 
 @pytest.mark.parametrize(("name", "value"), WRONG)
 def test_invalid_settings_raise_errors_with_their_name(name, value):
-    with pytest.raises(UsageError, match=f"^{name} must be .*, got {value!r}"):
+    with is_refused(UsageError, argument=ANY):
         TrainingSettings(**{name: value})
 
 
 def test_infinite_growth_of_weights_raises_an_error():
-    with pytest.raises(UsageError, match=r"growth must be .*, got inf"):
+    with is_refused(UsageError, argument="growth"):
         TrainingSettings(metric=MetricSettings(growth=math.inf))
 
 
@@ -133,10 +135,7 @@ def test_infinite_growth_of_weights_raises_an_error():
     ],
 )
 def test_a_run_has_exactly_one_length(wrong):
-    with pytest.raises(
-        UsageError,
-        match=r"pass exactly one of|(steps|epochs|cpu_seconds) must be .*, got ",
-    ):
+    with is_refused(UsageError, argument=ANY):
         Length(**wrong)
 
 
@@ -222,7 +221,7 @@ def test_margins_tighten_the_limits_that_they_name_and_no_others(
     factors = made[0]["margins"].factors
     assert factors == {**usual.factors, "joint-acceleration": 0.9}
     assert made[0]["margins"].insets == usual.insets
-    with pytest.raises(UsageError, match="no such term"):
+    with is_refused(UsageError, argument="terms"):
         prepare._loss(given, TrainingSettings(margins={"joint-speed": 0.9}))
 
 

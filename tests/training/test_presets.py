@@ -23,6 +23,7 @@ from cnpgen.training.settings import TrainingSettings
 from cnpgen.training.train import train_model
 from cnpgen.training.training_options import TrainingOptions
 from tests.examples.models import interpreted, loaded_problem_of
+from tests.refusals import is_refused
 
 EPOCHS, BATCHES = 4, 4  # 600 rows in batches of 128
 SMALL = replace(PAPER.settings, hidden=16, nodes=16)
@@ -339,10 +340,7 @@ def test_invalid_settings_raise_errors(changes, message):
 def test_too_few_control_points_for_the_degree_are_refused():
     record = loaded_problem_of("airhockey").record
     assert with_control_points(record, 15, None) is record
-    with pytest.raises(
-        UsageError,
-        match=r"path_control_points: .*a spline of degree 7 needs at least 8, got 7",
-    ):
+    with is_refused(UsageError, argument="path_control_points"):
         with_control_points(record, 7, None)
 
 

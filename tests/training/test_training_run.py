@@ -10,6 +10,7 @@ from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
+from unittest.mock import ANY
 
 import numpy as np
 import pytest
@@ -27,6 +28,7 @@ from cnpgen.training.training_options import TrainingOptions
 from tests.conftest import some, tiny_recipe
 from tests.examples.grouped import grouped
 from tests.examples.models import SMALL
+from tests.refusals import is_refused
 
 STEPS, SCORED = 30, 6
 Train = Callable[..., Trained]
@@ -225,17 +227,13 @@ def test_a_finished_model_is_returned_and_another_one_is_replaced_only_by_force(
 
 @pytest.mark.parametrize("out", ["missing/model.h5", "model", "model.jsonl", "."])
 def test_an_invalid_output_path_raises_an_error_before_any_work(train, out):
-    with pytest.raises(
-        UsageError, match=r"must be a file that ends in \.h5, in a folder that exists"
-    ):
+    with is_refused(UsageError, argument="out"):
         train(out)
 
 
 def test_a_file_that_is_no_model_is_not_overwritten(train, tmp_path):
     (tmp_path / "model.h5").write_bytes(b"mine")
-    with pytest.raises(
-        UsageError, match=r"model\.h5 exists and is no model.*force=True"
-    ):
+    with is_refused(UsageError, argument="force"):
         train()
     assert (tmp_path / "model.h5").read_bytes() == b"mine"
 
@@ -245,10 +243,7 @@ def test_a_file_that_is_no_model_is_not_overwritten(train, tmp_path):
     [{"check_rows": 0}, {"steps": 2.5}, {"steps": None, "cpu_seconds": float("inf")}],
 )
 def test_invalid_arguments_of_train_model_raise_errors_with_their_name(train, wrong):
-    with pytest.raises(
-        UsageError,
-        match=r"^(check_rows|steps|cpu_seconds) must be .*, got (0|2\.5|inf)",
-    ):
+    with is_refused(UsageError, argument=ANY):
         train(**wrong)
 
 
@@ -300,9 +295,7 @@ def test_force_resumes_the_same_run_and_discards_the_checkpoint_of_another(train
 def test_the_checkpoint_of_another_run_raises_an_error(train):
     with pytest.raises(CutOffError):
         train(watch=cut_at(5))
-    with pytest.raises(
-        UsageError, match=r"another run.*settings\.learning_rate \(0\.001, now 0\.002\)"
-    ):
+    with is_refused(UsageError, argument="force"):
         train(settings=replace(SMALL, learning_rate=2e-3))
     train(settings=replace(SMALL, learning_rate=2e-3), force=True)
 
@@ -314,7 +307,7 @@ def test_a_damaged_checkpoint_raises_an_error(train, tmp_path):
     data = bytearray(path.read_bytes())
     data[len(data) // 2] ^= 1
     path.write_bytes(data)
-    with pytest.raises(DatasetError, match=r"model\.checkpoint is damaged"):
+    with is_refused(DatasetError):
         train()
 
 
@@ -374,7 +367,7 @@ def test_other_files_beside_the_model_are_not_replaced_without_force(
 ):
     path = tmp_path / name
     path.write_text('{"step": 1, "my": "data"}\n')
-    with pytest.raises(UsageError, match=rf"{name} exists.*replace it with force=True"):
+    with is_refused(UsageError, argument="out"):
         train(begin=lambda *_: pytest.fail("trained"))
     assert path.read_text() == '{"step": 1, "my": "data"}\n'
     assert train(force=True).made
@@ -411,7 +404,7 @@ def test_resuming_with_a_changed_dataset_raises_an_error(train, tmp_path):
         train(watch=cut_at(5))
     other = tmp_path / "other"
     make_dataset(tiny_recipe("airhockey-hit", seed=7), other, workers=1)
-    with pytest.raises(UsageError, match=r"another run.*dataset\.(seed|fingerprint)"):
+    with is_refused(UsageError, argument="force"):
         train_model(
             other, tmp_path / "model.h5", steps=STEPS, settings=SMALL, check_rows=1
         )
@@ -420,7 +413,7 @@ def test_resuming_with_a_changed_dataset_raises_an_error(train, tmp_path):
 def test_a_dataset_without_a_second_split_raises_an_error(tmp_path):
     recipe = replace(tiny_recipe("airhockey-hit"), splits={"train": 64})
     make_dataset(recipe, tmp_path / "one", workers=1)
-    with pytest.raises(DatasetError, match="another one to validate with"):
+    with is_refused(DatasetError):
         train_model(tmp_path / "one", tmp_path / "model.h5", steps=2, settings=SMALL)
 
 

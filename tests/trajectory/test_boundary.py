@@ -17,6 +17,7 @@ from cnpgen.trajectory.boundary import (
     start_points,
 )
 from cnpgen.trajectory.trajectory_spec import TrajectorySpec
+from tests.refusals import is_refused
 
 N, JOINTS = 5, 6
 
@@ -165,9 +166,7 @@ def test_a_batch_agrees_with_its_single_motions() -> None:
 def test_a_path_of_a_single_span_raises_an_error() -> None:
     boundary = draw_boundary(np.random.default_rng(5), goal_ddq=False)
     spec = TrajectorySpec(degree=7, path_control_points=8, rate_control_points=8)
-    with pytest.raises(
-        UsageError, match="at least 9 path control points of degree 7, got 8"
-    ):
+    with is_refused(UsageError):
         start_points(boundary, np.ones((N, 8)), spec)
     assert assemble(boundary, np.zeros((N, 4, JOINTS)), np.ones((N, 8)), TrajectorySpec(
         degree=7, path_control_points=9, rate_control_points=8)).shape == (N, 9, JOINTS)  # fmt: skip
@@ -181,10 +180,7 @@ def test_conditions_of_different_joints_raise_an_error_with_their_names() -> Non
         draw_boundary(random, goal_ddq=False), goal_q=np.zeros((N, JOINTS + 1))
     )
     for points in (start_points, goal_points):
-        with pytest.raises(
-            UsageError,
-            match=f"same number of joints, got: start_q {JOINTS}, .*goal_q {JOINTS + 1}",
-        ):
+        with is_refused(UsageError):
             points(mixed, rate, spec)
 
 

@@ -23,6 +23,7 @@ from cnpgen.store.shard import read_shard
 from cnpgen.validate.validate_dataset import ValidationReport, validate_dataset
 from tests.conftest import SHIPPED, TINY_SHARD, Arm, needs_compiler, some, tiny_recipe
 from tests.examples.forged_shards import edit
+from tests.refusals import is_refused
 
 Tiny = Callable[[str], Path]
 FILES = [
@@ -466,23 +467,17 @@ def test_blocks_of_compiled_kernels_need_no_compiler(
 
 
 def test_missing_folders_and_negative_counts_are_refused(damaged: Path, tmp_path):
-    with pytest.raises(
-        UsageError, match="is not there, expected the folder of a dataset"
-    ):
+    with is_refused(UsageError, argument="folder"):
         validate_dataset(tmp_path / "nowhere")
-    with pytest.raises(
-        UsageError, match="regenerate must be an integer from 0 on, got -1"
-    ):
+    with is_refused(UsageError, argument="regenerate"):
         validate_dataset(damaged, regenerate=-1)
-    with pytest.raises(UsageError, match="workers must be an integer from 1 on, got 0"):
+    with is_refused(UsageError, argument="workers"):
         validate_dataset(damaged, deep=True, workers=0)
 
 
 def test_a_folder_that_holds_something_else_is_refused(tmp_path):
     (tmp_path / "mine.txt").write_text("no dataset")
-    with pytest.raises(
-        UsageError, match=r"is not a dataset of cnpgen: it has no specification.json"
-    ):
+    with is_refused(UsageError, argument="folder"):
         validate_dataset(tmp_path, deep=True, regenerate=3)
 
 
@@ -493,9 +488,7 @@ def test_a_backend_that_does_not_work_here_is_a_machine_error(
         raise MachineError("LLVM cannot be loaded")
 
     monkeypatch.setattr("cnpgen.kernels.compiled_kernel.find_final", fail)
-    with pytest.raises(
-        MachineError, match="made by the compiled backend, which does not work here"
-    ):
+    with is_refused(MachineError, argument="regenerate"):
         validate_dataset(damaged, regenerate=1)
     assert validate_dataset(damaged, deep=True, workers=1).ok
 

@@ -4,13 +4,13 @@ from pathlib import Path
 
 import numpy as np
 import pinocchio as pin
-import pytest
 
 from cnpgen.errors import MachineError
 from cnpgen.problems.load_robot import load_robot
 from cnpgen.problems.problem_file import load_problem
 from cnpgen.world.forward_kinematics import ForwardKinematics
 from tests.examples.shaped_robot import write_problem
+from tests.refusals import is_refused
 
 BRANCHING = """<robot name="r"><link name="a"/><link name="b"/><link name="c"/><link name="d"/>
 <joint name="turn" type="revolute"><parent link="a"/><child link="b"/><origin xyz="0.1 0.2 0.3" rpy="0.1 0.2 0.3"/>
@@ -56,7 +56,7 @@ def test_poses_that_differ_from_pinocchios_raise_an_error() -> None:
     model.jointPlacements[
         3
     ].translation += 1e-6  # the model changes after its coefficients were read
-    with pytest.raises(MachineError, match=r"differ from Pinocchio's by 1\.4e-06"):
+    with is_refused(MachineError):
         kinematics.poses(np.ones((model.nq, 3)))
 
 

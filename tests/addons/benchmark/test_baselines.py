@@ -46,6 +46,7 @@ from cnpgen.problems.problem_file import load_problem
 from cnpgen.robots.obstacle import Obstacle
 from cnpgen.trajectory.boundary import Boundary
 from tests.conftest import some
+from tests.refusals import is_refused
 
 
 def one_of(suite: str, index: int = 0) -> Plans:
@@ -230,7 +231,7 @@ def test_the_fields_of_aqp_limit_the_acceleration_of_the_mallet_and_slow_the_anc
 
 
 def test_aqp_refuses_transports() -> None:
-    with pytest.raises(UsageError, match="plans hits on a table"):
+    with is_refused(UsageError):
         AQP().prepare(Setting(one_of("heavy-100").problem))
 
 
@@ -285,9 +286,7 @@ def test_planners_use_the_tip_frame_if_a_joint_has_the_same_name() -> None:
 def test_baselines_refuse_obstacles_that_are_not_upright_boxes() -> None:
     problem, _ = open_problem(one_of("heavy-100").problem)
     ball = Obstacle(name="ball", kind="sphere", position=(0.4, 0.1, 0.5), radius=0.1)
-    with pytest.raises(
-        UsageError, match="supported are upright boxes only, 'heavy-object' has ball"
-    ):
+    with is_refused(UsageError):
         boxes_of(
             replace(problem, obstacle=(*problem.obstacle, ball)),
             one_of("heavy-100").scene,
@@ -307,7 +306,7 @@ def test_baselines_do_not_apply_to_problems_without_table_and_object(
         obstacle=(),
         constraint=tuple(c for c in heavy.constraint if is_of_joints(c)),
     )
-    with pytest.raises(UsageError, match="has neither table nor object"):
+    with is_refused(UsageError):
         planner.prepare(Setting(record_problem(free)))
 
 

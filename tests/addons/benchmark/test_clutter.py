@@ -21,6 +21,7 @@ from cnpgen.schema.catalogue import list_recipes
 from tests.examples.example_robots import needs_robots
 from tests.examples.shaped_robot import SELF, write_problem
 from tests.make.test_solve_scenes import LIMITS, SCENES
+from tests.refusals import is_refused
 
 CLUTTER = list_recipes("suite")["clutter"].with_suffix(".h5")
 SUITE = """name = "posts"
@@ -79,7 +80,7 @@ def test_suites_of_scene_files_are_boundary_problems(posts: Path) -> None:
         np.concatenate([scene.goal_q for scene in SCENES[:2]])
     )
     posts.write_text(SUITE + '[samples]\nrecipe = "heavy-object"\n')
-    with pytest.raises(RecipeError, match="exactly one of"):
+    with is_refused(RecipeError):
         load_suite(posts)
 
 
@@ -118,7 +119,5 @@ def test_scenes_of_a_suite_must_be_solvable_by_its_robot(posts: Path) -> None:
         SCENES[0], start_q=np.zeros(7), goal_q=np.zeros((1, 7))
     )
     save_scenes(posts.parent / "posts.h5", [scene])
-    with pytest.raises(
-        cnpgen.CnpgenError, match="7 joint positions at the start, the robot has 4"
-    ):
+    with is_refused(cnpgen.CnpgenError):
         load_suite(posts).problems()

@@ -1,13 +1,13 @@
 """The benchmark's planners that use a trained model."""
 
 import numpy as np
-import pytest
 
 from cnpgen.addons.benchmark.benchmark_planner import load_planner
 from cnpgen.benchmark import Setting, load_suite
 from cnpgen.errors import UsageError
 from cnpgen.planner.model_file import shipped_models
 from cnpgen.planner.planner import Planner
+from tests.refusals import is_refused
 
 
 def test_the_paper_planner_plans_with_its_model_file() -> None:
@@ -28,12 +28,9 @@ def test_the_paper_planner_plans_with_its_model_file() -> None:
 
 def test_the_paper_planner_refuses_a_missing_model_and_one_of_another_problem() -> None:
     setting = Setting(load_suite("hits-81").problems(1)[0].problem)
-    with pytest.raises(
-        UsageError,
-        match=r"cnp-b-paper needs a model file: pass --set cnp-b-paper.model=FILE",
-    ):
+    with is_refused(UsageError):
         load_planner("cnp-b-paper", {}).prepare(setting)
-    with pytest.raises(UsageError, match="is for another problem, they differ in"):
+    with is_refused(UsageError):
         load_planner(
             "cnp-b-paper", {"model": str(shipped_models()["heavy-object"])}
         ).prepare(setting)

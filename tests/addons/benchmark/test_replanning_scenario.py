@@ -15,6 +15,7 @@ from cnpgen.planner.planner import Planner
 from cnpgen.refine.refine_plans import refine_plans
 from cnpgen.schema.catalogue import list_recipes
 from tests.conftest import some
+from tests.refusals import is_refused
 
 
 @pytest.mark.parametrize("name", some(["replan", "online"], 1, "slow"))
@@ -77,10 +78,7 @@ def test_a_switch_after_the_end_of_the_first_motion_is_refused(tmp_path: Path) -
         .replace("250 ms", "400 ms")
     )
     (tmp_path / "late.toml").write_text(text, encoding="utf-8")
-    with pytest.raises(
-        RecipeError,
-        match=r"a first motion ends after 0\.3\d+ s, the switch is at 0\.4 s",
-    ):
+    with is_refused(RecipeError):
         load_suite(tmp_path / "late.toml").problems()
 
 
@@ -91,5 +89,5 @@ def test_a_grid_with_a_puck_in_its_center_is_refused(tmp_path: Path) -> None:
         .replace("rows = 4", "rows = 3")
     )
     (tmp_path / "odd.toml").write_text(text, encoding="utf-8")
-    with pytest.raises(RecipeError, match="an even number of pucks"):
+    with is_refused(RecipeError):
         load_suite(tmp_path / "odd.toml")

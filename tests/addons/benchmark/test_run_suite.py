@@ -50,6 +50,7 @@ from tests.conftest import some
 from tests.examples.example_robots import needs_robots
 from tests.examples.grouped import grouped
 from tests.examples.installed import installed_kind
+from tests.refusals import is_refused
 
 UNRELIABLE = """
 import os, time
@@ -298,7 +299,7 @@ def test_parallel_planners_return_the_results_of_one(
 @pytest.mark.slow
 def test_results_of_another_run_are_refused(tmp_path: Path) -> None:
     run_benchmark("hits-81", tmp_path, planners=["cnpgen"], n=1)
-    with pytest.raises(UsageError, match="holds results of another run"):
+    with is_refused(UsageError, argument="force"):
         run_benchmark("hits-110", tmp_path, planners=["cnpgen"], n=1)
     run_benchmark("hits-110", tmp_path, planners=["cnpgen"], n=1, force=True)
     assert (
@@ -368,16 +369,12 @@ def test_deeply_nested_lines_are_ignored_and_a_pipe_is_refused(tmp_path: Path) -
         file.write("[" * 100_000 + "\n")
     assert open_results(tmp_path / "a.jsonl", {}).rows == {}
     os.mkfifo(tmp_path / "b.jsonl")
-    with pytest.raises(
-        UsageError, match="is a device or a pipe, expected the results of a planner"
-    ):
+    with is_refused(UsageError, argument="path"):
         open_results(tmp_path / "b.jsonl", {})
 
 
 def test_mistakes_are_reported_before_any_work(tmp_path: Path) -> None:
-    with pytest.raises(
-        UsageError, match=r"unknown planner 'cnpgn'.*did you mean 'cnpgen'"
-    ):
+    with is_refused(UsageError, argument="planners"):
         run_benchmark("hits-81", tmp_path, planners=["cnpgn"])
     for old, new in {"cnp-b": "cnpgen", "cnp-b+refine": "cnpgen+refine"}.items():
         with pytest.raises(
@@ -385,9 +382,9 @@ def test_mistakes_are_reported_before_any_work(tmp_path: Path) -> None:
             match=rf"unknown planner '{re.escape(old)}' \(its name is now '{re.escape(new)}'\)",
         ):
             run_benchmark("hits-81", tmp_path, planners=[old])
-    with pytest.raises(UsageError, match="unknown plant"):
+    with is_refused(UsageError, argument="plants"):
         run_benchmark("hits-81", tmp_path, planners=["cnpgen"], plants=["lighter"])
-    with pytest.raises(UsageError, match="time_limit must be above 0"):
+    with is_refused(UsageError, argument="time_limit"):
         run_benchmark(
             "hits-81",
             tmp_path,
@@ -395,7 +392,7 @@ def test_mistakes_are_reported_before_any_work(tmp_path: Path) -> None:
             options=BenchmarkOptions(time_limit=0),
         )
     for tolerance in (-1e-3, float("inf"), True):
-        with pytest.raises(UsageError, match="plane_tolerance must"):
+        with is_refused(UsageError, argument="plane_tolerance"):
             run_benchmark(
                 "hits-81",
                 tmp_path,
@@ -508,7 +505,7 @@ def test_every_problem_has_its_own_random_numbers(random: str, tmp_path: Path) -
     repeated = drawn(tmp_path / "repeated", random, n=3, repeat=2)
     assert repeated[:3] == whole
     assert len({str(answer) for answer in repeated}) == 6
-    with pytest.raises(UsageError, match="seed"):
+    with is_refused(UsageError, argument="force"):
         run_benchmark(
             "hits-81",
             tmp_path / "whole",
@@ -572,7 +569,7 @@ def test_other_parameters_of_a_planner_are_another_run(tmp_path: Path) -> None:
     )
     head = json.loads((tmp_path / "trajopt.jsonl").read_text().splitlines()[0])
     assert head["parameters"] == {"iterations": 3}
-    with pytest.raises(UsageError, match=r"another run \(other parameters\)"):
+    with is_refused(UsageError, argument="force"):
         run_benchmark("hits-81", tmp_path, planners=["trajopt"], n=1)
     more = run_benchmark(
         "hits-81",
@@ -583,7 +580,7 @@ def test_other_parameters_of_a_planner_are_another_run(tmp_path: Path) -> None:
         force=True,
     )
     assert more.results["trajopt"][0]["answer"] != few.results["trajopt"][0]["answer"]
-    with pytest.raises(UsageError, match="trajopt: iterations: 0 is too small"):
+    with is_refused(UsageError, argument="parameters"):
         run_benchmark(
             "hits-81",
             tmp_path,
@@ -591,9 +588,7 @@ def test_other_parameters_of_a_planner_are_another_run(tmp_path: Path) -> None:
             n=1,
             parameters={"trajopt": {"iterations": 0}},
         )
-    with pytest.raises(
-        UsageError, match="parameters must be of planners of this run, got those of aqp"
-    ):
+    with is_refused(UsageError, argument="parameters"):
         run_benchmark(
             "hits-81", tmp_path, planners=["trajopt"], n=1, parameters={"aqp": {}}
         )
@@ -696,9 +691,7 @@ def test_a_report_covers_the_folder_and_nothing_else(
     assert r"\caption{" in latex
     bare = re.sub(r"^%.*$|\{!\}\{%$", "", latex, flags=re.M)
     assert re.search(r"(?<!\\)%", bare) is None
-    with pytest.raises(
-        UsageError, match="reference must be one of cnpgen, random, got 'solve'"
-    ):
+    with is_refused(UsageError, argument="reference"):
         run_benchmark(
             "hits-81",
             folder,
@@ -709,7 +702,7 @@ def test_a_report_covers_the_folder_and_nothing_else(
     (folder / "other.jsonl").write_text(
         '{"format": "cnpgen-benchmark", "suite": "heavy-100"}\n'
     )
-    with pytest.raises(UsageError, match=r"other.jsonl holds results of another run"):
+    with is_refused(UsageError, argument="force"):
         run_benchmark("hits-81", folder, planners=[random], n=1)
     run_benchmark("hits-81", folder, planners=[random], n=1, force=True)
     assert not (folder / "other.jsonl").exists()
@@ -750,7 +743,7 @@ def test_figures_have_success_over_planning_time_and_suitable_axes(
 
 def test_a_damaged_record_of_runs_is_named(tmp_path: Path) -> None:
     (tmp_path / "runs.json").write_text('[{"date": 5}]')
-    with pytest.raises(DatasetError, match=r"runs.json is damaged: .*; delete it"):
+    with is_refused(DatasetError):
         run_benchmark("hits-81", tmp_path, planners=["cnpgen"], n=1)
 
 

@@ -9,6 +9,7 @@ from cnpgen.addons.benchmark.suite import load_suite
 from cnpgen.errors import RecipeError
 from cnpgen.schema.catalogue import list_recipes
 from tests.examples.plans import ROBOTS
+from tests.refusals import is_refused
 
 
 def test_every_shipped_suite_is_named_after_its_file() -> None:
@@ -80,7 +81,7 @@ def test_a_suite_has_pucks_or_samples_and_not_both(tmp_path: Path) -> None:
     (tmp_path / "both.toml").write_text(
         text + '\n[samples]\nrecipe = "heavy-object"\n', encoding="utf-8"
     )
-    with pytest.raises(RecipeError, match="expected exactly one"):
+    with is_refused(RecipeError):
         load_suite(tmp_path / "both.toml")
 
 
@@ -89,9 +90,7 @@ def test_a_grid_without_end_is_refused_before_it_is_made(tmp_path: Path) -> None
     (tmp_path / "large.toml").write_text(
         text.replace("= 9", "= 9000000000"), encoding="utf-8"
     )
-    with pytest.raises(
-        RecipeError, match="a grid of 81,000,000,000,000,000,000 pucks is too large"
-    ):
+    with is_refused(RecipeError):
         load_suite(tmp_path / "large.toml")
 
 
@@ -118,12 +117,12 @@ def test_pucks_need_a_table(tmp_path: Path) -> None:
     (tmp_path / "heavy.toml").write_text(
         text.replace('"airhockey"', '"heavy-object"'), encoding="utf-8"
     )
-    with pytest.raises(RecipeError, match="no table to put pucks on"):
+    with is_refused(RecipeError):
         load_suite(tmp_path / "heavy.toml").problems()
 
 
 def test_an_unknown_suite_is_refused_by_name() -> None:
-    with pytest.raises(RecipeError, match="hits-81"):
+    with is_refused(RecipeError, argument="name_or_path"):
         load_suite("hits-82")
 
 

@@ -49,6 +49,7 @@ from cnpgen.planner.network.architecture import (
 from cnpgen.plans import Plans, open_problem
 from cnpgen.refine.refine_plans import solve_plans
 from tests.conftest import some
+from tests.refusals import is_refused
 
 Array = NDArray[np.float64]
 
@@ -106,7 +107,7 @@ def test_valid_states_are_those_of_pinocchio_and_cbirrt(suite: str) -> None:
 
 def test_problems_without_table_and_object_are_refused() -> None:
     problem, robot = open_problem(one_of("heavy-100").problem)
-    with pytest.raises(UsageError, match="neither"):
+    with is_refused(UsageError):
         StateCheck(replace(problem, object=None, obstacle=()), robot)
 
 
@@ -328,7 +329,7 @@ def test_a_network_trained_on_plans_proposes_their_next_configurations(
     save_proposals(tmp_path / "a.h5", network)
     reread = load_proposals(tmp_path / "a.h5")
     assert relative_error(reread, plans) == relative_error(network, plans)
-    with pytest.raises(UsageError, match="no plans"):
+    with is_refused(UsageError):
         train_proposals(plans[:0], ahead=0.1)
 
 
@@ -363,14 +364,11 @@ def test_shipped_networks_propose_the_next_configurations_of_new_plans(
 
 
 def test_a_missing_or_damaged_network_is_reported(tmp_path: Path) -> None:
-    with pytest.raises(
-        UsageError,
-        match="no network proposes configurations for 'panda-cup', only for airhockey, heavy",
-    ):
+    with is_refused(UsageError):
         shipped_proposals("panda-cup")
     damaged = tmp_path / "damaged.h5"
     damaged.write_bytes(shipped_proposals("airhockey").read_bytes()[:-9])
-    with pytest.raises(DatasetError, match="damaged"):
+    with is_refused(DatasetError):
         load_proposals(damaged)
 
 
@@ -389,9 +387,7 @@ def test_mpc_mpnet_stays_within_limits_and_approaches_the_goal(suite: str) -> No
 def test_a_network_of_another_arm_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     other = "cnpgen.addons.benchmark.planners.mpc_mpnet.shipped_proposals"
     monkeypatch.setattr(other, lambda _: shipped_proposals("heavy-object"))
-    with pytest.raises(
-        UsageError, match="'airhockey' is trained for another arm or scene"
-    ):
+    with is_refused(UsageError):
         MPCMPNet().prepare(Setting(one_of("hits-81").problem))
 
 

@@ -12,6 +12,7 @@ from cnpgen.addons.deploy.export_planner import planner_files, write_planner
 from cnpgen.make.draw_boundary_problems import draw_boundary_problems
 from cnpgen.planner.model_file import find_model
 from tests.addons.deploy.ros2_declarations import definitions, header, write_headers
+from tests.refusals import is_refused
 
 CXX = next(filter(None, map(shutil.which, ("c++", "g++", "clang++"))), None)
 CC = next(filter(None, map(shutil.which, ("cc", "gcc", "clang"))), None)
@@ -118,7 +119,7 @@ def test_the_node_compiles_against_the_published_interfaces(tmp_path):
 
 
 def test_a_type_without_a_definition_is_refused():
-    with pytest.raises(ValueError, match="std_msgs/Missing"):
+    with is_refused(ValueError):
         header("a/msg/B", "std_msgs/Missing value", set())
 
 

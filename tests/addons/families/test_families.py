@@ -33,6 +33,7 @@ from cnpgen.world.pose_ik import PoseKinematics
 from tests.examples.example_robots import needs_robots
 from tests.examples.numpy_observations import signed_distances
 from tests.examples.scene_arm import write_arm
+from tests.refusals import is_refused
 
 ENDS_MARGIN = 0.005
 
@@ -131,13 +132,11 @@ def test_parameters_have_units_and_are_checked() -> None:
     family = load_family("tabletop", {"tables": 2, "height": "[10, 20] cm"})
     assert vars(family)["tables"] == Range(2, 2)
     assert vars(family)["height"] == Range(0.1, 0.2)
-    with pytest.raises(
-        UsageError, match=r"unknown family 'tabeltop' \(did you mean 'tabletop'"
-    ):
+    with is_refused(UsageError, argument="name"):
         load_family("tabeltop")
-    with pytest.raises(UsageError, match="hight: unknown key"):
+    with is_refused(UsageError, argument="parameters"):
         load_family("tabletop", {"hight": 1})
-    with pytest.raises(UsageError, match="objects"):
+    with is_refused(UsageError, argument="parameters"):
         load_family("tabletop", {"objects": [0, 1000]})
 
 
@@ -209,9 +208,9 @@ def test_goals_are_at_the_grasps(arm: Problem) -> None:
 
 def test_robots_out_of_reach_are_an_error(arm: Problem) -> None:
     far = load_family("cage", {"distance": "5 m"})
-    with pytest.raises(UsageError, match="are they within its reach"):
+    with is_refused(UsageError):
         make_scenes(far, arm, 1)
-    with pytest.raises(UsageError, match="geometry"):
+    with is_refused(UsageError, argument="problem"):
         make_scenes("cage", "heavy-object", 1)
 
 
@@ -269,7 +268,5 @@ def test_every_family_has_problems_for_a_panda(name: str) -> None:
 
 @needs_robots
 def test_families_refuse_problems_on_a_manifold():
-    with pytest.raises(
-        UsageError, match="'panda-cup' has the equality constraint 'vertical'"
-    ):
+    with is_refused(UsageError, argument="problem"):
         make_scenes("tabletop", "panda-cup", 1)

@@ -24,6 +24,7 @@ from cnpgen.make.make_dataset import make_dataset
 from cnpgen.store.field import Field
 from cnpgen.store.files.written_files import LIST
 from tests.examples.store import SPEC
+from tests.refusals import is_refused
 
 RECIPE = """
 name = "hits"
@@ -232,7 +233,7 @@ def test_files_of_an_earlier_state_are_removed_and_others_refused_by_name(
 def test_a_repository_inside_the_dataset_is_refused(
     inside: str, tmp_path: Path
 ) -> None:
-    with pytest.raises(UsageError, match="out must be a folder outside the dataset"):
+    with is_refused(UsageError, argument="out"):
         publish_dataset(tmp_path, "lab/hits", out=tmp_path / inside, dry_run=True)
     assert not list(tmp_path.iterdir())
 

@@ -20,6 +20,7 @@ from cnpgen.robots.robot_spec import LimitSources
 from cnpgen.robots.urdf import urdf_tree
 from cnpgen.robots.urdf_changes import SRDF_NAMES, with_disabled_pairs
 from cnpgen.robots.urdf_elements import _KNOWN, check_elements, unread_elements
+from tests.refusals import is_refused
 
 BOX = '<geometry><box size="0.4 0.08 0.08"/></geometry>'
 INERTIA = '<inertia ixx="0.01" ixy="0" ixz="0" iyy="0.06" iyz="0" izz="0.06"/>'
@@ -97,9 +98,7 @@ def test_a_torque_limit_below_the_gravity_load_is_replaced_with_a_doubt(
 
 def test_masses_in_grams_are_refused(tmp_path: Path) -> None:
     upper = UPPER.replace('value="4"', 'value="4000"') + SHAPE
-    with pytest.raises(
-        RecipeError, match=r"j1: gravity needs .* are its masses in g\?"
-    ):
+    with is_refused(RecipeError):
         initial(write(tmp_path / "a.urdf", upper=upper))
 
 
@@ -152,7 +151,7 @@ def test_a_recipe_with_a_locked_joint_that_cannot_be_at_zero_is_read(
     file.write_text(text)
     assert load_problem(file).robot.locked_positions == (0.3,)
     file.write_text(re.sub("locked_(joints|positions) = .*", "", text))
-    with pytest.raises(RecipeError, match="'g1' is not planned and stays at zero"):
+    with is_refused(RecipeError):
         load_problem(file)
 
 
@@ -249,9 +248,7 @@ def test_the_remedy_for_a_mesh_in_another_unit_is_the_unit_of_its_file(
     dae(tmp_path / "a.dae", unit)
     upper = UPPER + MESH.format(name="a.dae")
     path = write(tmp_path / "a.urdf", upper=upper)
-    with pytest.raises(
-        RecipeError, match=f'write scale="{unit} {unit} {unit}" in its <mesh>'
-    ):
+    with is_refused(RecipeError):
         initial(path)
     scaled = upper.replace('"a.dae"', f'"a.dae" scale="{unit} {unit} {unit}"')
     assert "upper" in links(load_robot(initial(write(path, upper=scaled)).problem))
@@ -260,13 +257,11 @@ def test_the_remedy_for_a_mesh_in_another_unit_is_the_unit_of_its_file(
 def test_a_broken_mesh_names_its_link_and_can_be_left_out(tmp_path: Path) -> None:
     (tmp_path / "broken.stl").write_bytes(b"solid nothing")
     path = write(tmp_path / "a.urdf", upper=UPPER + MESH.format(name="broken.stl"))
-    with pytest.raises(RecipeError, match=r"a mesh of link 'upper'; .*skipped_meshes"):
+    with is_refused(RecipeError):
         initial(path)
     made = initial(path, skipped_meshes=("upper",))
     assert "upper" not in links(load_robot(made.problem))
-    with pytest.raises(
-        RecipeError, match="skipped_meshes: the URDF has no link 'uper'"
-    ):
+    with is_refused(RecipeError):
         initial(path, skipped_meshes=("uper",))
 
 
@@ -275,7 +270,7 @@ def test_the_default_tip_is_no_finger(tmp_path: Path) -> None:
     assert read_arm(write(tmp_path / "a.urdf", more=more), None).tip == "wrist"
     tcp = '<link name="tcp"/><joint name="jt" type="fixed"><parent link="wrist"/><child link="tcp"/></joint>'
     assert read_arm(write(tmp_path / "b.urdf", more=more + tcp), None).tip == "tcp"
-    with pytest.raises(UsageError, match="2 links have no child: f1, tcp"):
+    with is_refused(UsageError):
         read_arm(write(tmp_path / "c.urdf", more=finger() + tcp), None)
 
 
@@ -457,14 +452,14 @@ def test_the_jerk_and_deceleration_of_a_urdf_limit_the_arm(tmp_path: Path) -> No
     )
     assert "is not read" not in notes(path)
     wrong = write(path, limit=limit.replace("deceleration", "deceleraton"))
-    with pytest.raises(RecipeError, match="did you mean 'deceleration'"):
+    with is_refused(RecipeError):
         initial(wrong)
 
 
 def test_a_follower_needs_a_leader_that_the_urdf_has(tmp_path: Path) -> None:
     mimic = "<mimic joint='g9' multiplier='-1'/>"
     path = write(tmp_path / "a.urdf", more=finger() + finger("f2", "g2", mimic=mimic))
-    with pytest.raises(RecipeError, match="<mimic> of 'g2', which names no joint of"):
+    with is_refused(RecipeError):
         initial(path)
     initial(path, allow_unused=("mimic",))
 
@@ -474,9 +469,7 @@ def test_no_planned_joint_is_passive(tmp_path: Path) -> None:
     srdf = tmp_path / "a.srdf"
     srdf.write_text("<robot name='arm'><passive_joint name='j2'/></robot>")
     with_disabled_pairs(path.read_text(), srdf, planned=["j1"])
-    with pytest.raises(
-        RecipeError, match="<passive_joint> names the planned joint 'j2'"
-    ):
+    with is_refused(RecipeError):
         with_disabled_pairs(path.read_text(), srdf, planned=["j1", "j2"])
 
 
@@ -488,7 +481,7 @@ def test_the_root_of_urdf_and_srdf_is_a_robot(tmp_path: Path) -> None:
     srdf.write_text(f"<robot name='arm'>{groups}{pair}</robot>")
     with_disabled_pairs(path.read_text(), srdf)
     srdf.write_text(f"<robt name='arm'>{pair}</robt>")
-    with pytest.raises(RecipeError, match="its root is <robt>, expected <robot>"):
+    with is_refused(RecipeError):
         with_disabled_pairs(path.read_text(), srdf)
 
 
@@ -500,12 +493,12 @@ def test_the_loss_of_a_misspelt_element_is_accepted_by_name_and_recorded(
     found = initial(path, allow_unused=("colision",))
     assert found.problem.robot.allow_unused == ("colision",)
     assert "<colision> in <link> is not read, 1 time" in "".join(found.notes)
-    with pytest.raises(UsageError, match=r"has no 'colison' \(did you mean 'colision'"):
+    with is_refused(UsageError, argument="allow_unused"):
         initial(path, allow_unused=("colision", "colison"))
     srdf = tmp_path / "a.srdf"
     srdf.write_text("<robot name='a'><disable_collision link1='a'/></robot>")
     tree = urdf_tree(srdf.read_text())
-    with pytest.raises(RecipeError, match="did you mean 'disable_collisions'"):
+    with is_refused(RecipeError):
         check_elements(tree, srdf, SRDF_NAMES)
     check_elements(tree, srdf, SRDF_NAMES, allow_unused=["disable_collision"])
 
@@ -514,7 +507,7 @@ def test_a_name_beside_the_one_that_it_resembles_is_not_misspelt() -> None:
     limit = "<joint><limit velocity='1' gear_velocity='9'/></joint>"
     check_elements(urdf_tree(f"<robot>{limit}</robot>"), Path("arm.urdf"))
     other = limit.replace(" velocity", " v")
-    with pytest.raises(RecipeError, match=r"arm.urdf: the attribute 'gear_velocity'"):
+    with is_refused(RecipeError):
         check_elements(urdf_tree(f"<robot>{other}</robot>"), Path("arm.urdf"))
 
 

@@ -17,6 +17,7 @@ from cnpgen.problems.problem_file import load_problem
 from cnpgen.problems.problem_record import open_problem, record_problem
 from cnpgen.robots.robot_spec import PerJoint
 from tests.examples.example_robots import needs_robots
+from tests.refusals import is_refused
 
 pytestmark = needs_robots
 
@@ -303,7 +304,7 @@ def test_a_fault_stops_the_arm_without_a_jump_until_reset(controller, event, out
     join = event(controller)
     assert (join.outcome, join.accepted) == (outcome, False)
     assert controller.executor.stopped is outcome
-    with pytest.raises(UsageError, match="more of set points to stop"):
+    with is_refused(UsageError):
         controller.executor.reset((controller.points[-1].q, np.zeros(7)))
     controller.run(0.1)
     assert controller.step(chunk(0.9)).outcome is outcome  # it is latched
@@ -342,21 +343,21 @@ def test_a_new_executor_waits_for_reset(shared):
         fresh.stop,
         lambda: fresh.step(0.0, chunk(0.0), 0.0, (HOME, np.zeros(7))),
     ):
-        with pytest.raises(UsageError, match=r"waits for reset\(measured\)"):
+        with is_refused(UsageError):
             call()
-    with pytest.raises(UsageError, match="panda_joint3 moves"):
+    with is_refused(UsageError, argument="measured"):
         fresh.reset((HOME, [0, 0, 0.3, 0, 0, 0, 0]))
-    with pytest.raises(UsageError, match="at rest"):
+    with is_refused(UsageError, argument="measured"):
         fresh.reset((HOME, np.full(7, np.nan)))
-    with pytest.raises(UsageError, match="deg"):
+    with is_refused(UsageError, argument="measured"):
         fresh.reset((np.degrees(HOME), np.zeros(7)))
-    with pytest.raises(UsageError, match="finite"):
+    with is_refused(UsageError, argument="measured"):
         fresh.reset((np.full(7, np.nan), np.zeros(7)))
     assert shared.stopped is SwitchOutcome.STOPPED
 
 
 def test_stop_holds_until_reset_and_reset_needs_a_stop(controller):
-    with pytest.raises(UsageError, match="has not stopped"):
+    with is_refused(UsageError):
         controller.executor.reset((HOME, np.zeros(7)))
     assert controller.step(chunk(0.0)).accepted
     controller.run(0.5)
@@ -459,7 +460,7 @@ def test_wrong_options_and_shapes_are_refused(controller):
             controller.executor.step(controller.time, values, controller.time, measured)
     assert controller.step(chunk(0.0)).accepted
     controller.run(0.2)
-    with pytest.raises(UsageError, match="has 9 columns, earlier ones have 8"):
+    with is_refused(UsageError, argument="chunk"):
         controller.step(np.zeros((50, 9)))
 
 
@@ -488,7 +489,7 @@ def test_a_chunk_that_is_refused_does_not_fix_the_columns_and_large_values_are_o
     )
     controller.run(0.01)
     assert controller.step(1e300 * chunk(0.0)).outcome is SwitchOutcome.OUTLIER
-    with pytest.raises(UsageError, match="earlier ones have 8"):
+    with is_refused(UsageError, argument="chunk"):
         controller.step(chunk(0.0)[:, :7])
 
 
@@ -508,13 +509,13 @@ def test_options_that_disable_a_check_are_refused(wrong):
 
 @pytest.mark.parametrize("wrong", [1e308, True, -1.0], ids=str)
 def test_times_to_rest_that_disable_the_check_are_refused(wrong):
-    with pytest.raises(UsageError, match="stop_after"):
+    with is_refused(UsageError, argument="stop_after"):
         ChunkOptions(stop_after=wrong)
 
 
 @pytest.mark.parametrize("wrong", [-1.0, 0.0, np.inf, np.nan], ids=str)
 def test_noise_that_disables_a_check_is_refused(wrong):
-    with pytest.raises(UsageError, match="noise"):
+    with is_refused(UsageError, argument="noise"):
         ChunkOptions(noise=wrong)
 
 
@@ -530,13 +531,13 @@ def test_future_set_points_are_those_that_are_served_later():
     for before, served in zip(planned, controller.points[-99:], strict=True):
         for a, b in zip(before, served, strict=True):
             np.testing.assert_allclose(a, b, atol=1e-12)
-    with pytest.raises(UsageError, match="kept motions begin"):
+    with is_refused(UsageError, argument="time"):
         controller.executor.state_at(times[-1] - 30.0)
-    with pytest.raises(UsageError, match="waits for reset"):
+    with is_refused(UsageError):
         ChunkExecutor("panda-3kg", **OPTIONS).state_at(0.0)
 
 
 def test_measured_positions_outside_the_limits_are_refused():
     executor = ChunkExecutor("panda-3kg", **OPTIONS)
-    with pytest.raises(UsageError, match="outside its position limits"):
+    with is_refused(UsageError, argument="measured"):
         executor.reset((HOME + 3.0, np.zeros(7)))

@@ -15,6 +15,7 @@ from cnpgen.plans.evaluate import evaluate_plans
 from cnpgen.problems.problem_record import open_problem
 from cnpgen.results import HitOptions
 from tests.conftest import Arm
+from tests.refusals import is_refused
 
 TARGET = np.array([2.49, 0.0])  # m
 CONTACT_RANGE = 0.0798  # m, sum of the radii
@@ -287,7 +288,7 @@ def test_hits_of_moving_pucks_score_in_the_simulator(planner, still, plant):
 
 
 def test_invalid_arguments_raise_errors(planner, still):
-    with pytest.raises(UsageError, match="puck has 2 hits, another argument has 3"):
+    with is_refused(UsageError, argument="puck"):
         plan_hits(
             planner,
             still,
@@ -296,13 +297,11 @@ def test_invalid_arguments_raise_errors(planner, still):
             puck_velocity=np.zeros((3, 2)),
         )
     moving = (still[0], still[1] + 0.1, still[2])
-    with pytest.raises(UsageError, match="state is not at rest"):
+    with is_refused(UsageError, argument="state"):
         plan_hits(planner, moving, [1.0, 0.1], TARGET, meeting_time=0.6)
-    with pytest.raises(UsageError, match="pass home="):
+    with is_refused(UsageError, argument="home"):
         _ = plan_hits(planner, still, [1.0, 0.1], TARGET).sequences
-    with pytest.raises(UsageError, match="home must have shape"):
+    with is_refused(UsageError, argument="home"):
         plan_hits(planner, still, [1.0, 0.1], TARGET, home=np.zeros((2, 6)))
-    with pytest.raises(
-        UsageError, match="restitution must be finite and not negative, got -1"
-    ):
+    with is_refused(UsageError, argument="restitution"):
         PuckModel(restitution=-1.0)

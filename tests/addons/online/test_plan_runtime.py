@@ -19,6 +19,7 @@ from cnpgen.plans.join import JoinedPlans, join_plans
 from cnpgen.problems.problem_record import open_problem
 from cnpgen.results import HitOptions
 from tests.conftest import HANGING, Arm
+from tests.refusals import is_refused
 
 TARGET = [2.49, 0.0]  # m
 SHARE = 0.95  # of the maximum hitting speed, so that velocities stay within their limits after the hit
@@ -190,12 +191,10 @@ def test_a_stop_of_an_arm_at_rest_changes_nothing(planner, runtime):
 
 
 def test_invalid_arguments_raise_errors(planner, runtime):
-    with pytest.raises(UsageError, match=r"q must be finite and have shape \(6,\)"):
+    with is_refused(UsageError, argument="q"):
         PlanRuntime(planner, np.zeros(5))
     plans = planner.plan(np.zeros((2, 6)), np.ones((2, 6)))
-    with pytest.raises(
-        UsageError, match="plan must be one plan or one sequence, got 2"
-    ):
+    with is_refused(UsageError, argument="plan"):
         runtime.switch(plans, 0.5)
 
 
@@ -239,7 +238,7 @@ def test_a_hit_that_is_replanned_in_flight_scores_in_the_simulator_at_1_khz(
 def test_set_points_at_impossible_times_are_refused_and_change_nothing(planner, time):
     runtime = PlanRuntime(planner, planner.robot.home)
     for evaluate in (runtime.set_point, runtime.state_at):
-        with pytest.raises(UsageError, match=r"^time must be"):
+        with is_refused(UsageError, argument="time"):
             evaluate(time)
     assert (
         runtime.switch(
@@ -259,9 +258,9 @@ def test_plans_and_stops_have_the_parameters_of_the_runtime():
     assert refused.outcome is SwitchOutcome.INVALID
     assert "parameters" in refused.detail
     assert runtime.switch(plans[6.0], 0.0).accepted
-    with pytest.raises(UsageError, match="payload_mass must be from 4 to 14, got 15"):
+    with is_refused(UsageError, argument="parameters"):
         PlanRuntime(planner, start, parameters=[15.0])
-    with pytest.raises(UsageError, match=r"must have shape \(1,\)"):
+    with is_refused(UsageError, argument="parameters"):
         PlanRuntime(planner, start, parameters=[[5.0], [6.0]])
 
 
@@ -277,5 +276,5 @@ def test_a_planner_that_ends_the_process_is_a_failed_request_and_the_next_one_is
 
 @pytest.mark.parametrize("step", [1e-8, 0.01])
 def test_grids_that_miss_a_limit_or_fill_the_memory_are_refused(planner, step):
-    with pytest.raises(UsageError, match=r"0\.0001 to 0\.004 s"):
+    with is_refused(UsageError, argument="grid_step"):
         PlanRuntime(planner, planner.robot.home, grid_step=step)

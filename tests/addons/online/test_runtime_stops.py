@@ -23,6 +23,7 @@ from tests.conftest import some
 from tests.examples.example_robots import needs_robots
 from tests.faults.chunk_orders import run_chunk_orders
 from tests.faults.stop_orders import check_states, run_orders, small_arm, valid_plans
+from tests.refusals import is_refused
 
 TARGET = [2.49, 0.0]  # m
 TICK_S = 1e-3
@@ -162,23 +163,23 @@ def test_a_stop_holds_although_a_replan_was_being_computed(planner, executing):
 
 
 def test_a_stopped_runtime_resumes_at_rest_and_only_after_the_stop(planner, executing):
-    with pytest.raises(UsageError, match="was not stopped, so it cannot resume"):
+    with is_refused(UsageError):
         executing.resume(planner.robot.home)
     executing.set_point(0.15)
     stop = executing.stop(0.2)
     assert executing.stop(0.3) is stop  # a second stop changes nothing
     measured = executing.state_at(stop.end_time).q + 1e-3
-    with pytest.raises(UsageError, match="is before that or before the last set"):
+    with is_refused(UsageError, argument="at"):
         executing.resume(measured)
     executing.set_point(np.arange(0.15, stop.end_time + 0.5, 0.01))
     for wrong in (measured[:3], np.full(6, np.nan), "here"):
-        with pytest.raises(UsageError, match="measured_q must be"):
+        with is_refused(UsageError, argument="measured_q"):
             executing.resume(wrong)
     assert executing.stopped
     executing.resume(measured)
     assert not executing.stopped
     at = stop.end_time + 1.0
-    with pytest.raises(UsageError, match="was not stopped"):
+    with is_refused(UsageError):
         executing.resume(measured, at=at)
     state = executing.set_point([at - 0.2, at])
     np.testing.assert_array_equal(state.q, [measured, measured])
@@ -290,12 +291,12 @@ def test_close_returns_although_a_planner_hangs(executing):
     assert time.monotonic() - begun < 10
     assert hanging.result(timeout=1).outcome is SwitchOutcome.CLOSED
     assert waiting.result(timeout=1).outcome is SwitchOutcome.CLOSED
-    with pytest.raises(UsageError, match="runtime is closed"):
+    with is_refused(UsageError):
         executing.replan(lambda _: None, 0.5)
     release.set()
     assert executing.close()  # the planner has returned, and its thread has ended
     for timeout in (0.0, -1.0, np.nan, True):
-        with pytest.raises(UsageError, match="timeout must be"):
+        with is_refused(UsageError, argument="timeout"):
             executing.close(timeout=timeout)
 
 
@@ -310,14 +311,14 @@ def test_set_points_in_the_past_are_refused_and_the_history_is_what_was_executed
     executed = runtime.set_point(times)
     assert runtime.switch(planner.plan(away, home), 4.0).accepted
     for past in (0.999, 0.5, 2.98, [3.5, 0.5], -1e9, [2.995, 2.994]):
-        with pytest.raises(UsageError, match=r"^time must"):
+        with is_refused(UsageError, argument="time"):
             runtime.set_point(past)
     recent = times >= 2.99 - 1.0
     history = runtime.state_at(times[recent])
     for old, kept in zip(executed, history, strict=True):
         np.testing.assert_array_equal(old[recent], kept)
     for past in (0.999, 1.98, -1.0):
-        with pytest.raises(UsageError, match=r"must be from 1\.99 s on"):
+        with is_refused(UsageError, argument="time"):
             runtime.state_at(past)
     np.testing.assert_array_equal(runtime.set_point(2.99).q, executed.q[-1])
 
@@ -325,7 +326,7 @@ def test_set_points_in_the_past_are_refused_and_the_history_is_what_was_executed
 def test_steps_above_the_stated_one_are_refused_and_change_nothing(planner, executing):
     executing.set_point(0.2)
     for ahead in (0.6, [0.21, 0.6]):
-        with pytest.raises(UsageError, match=r"time must have smaller steps: joint \d"):
+        with is_refused(UsageError, argument="time"):
             executing.set_point(ahead)
     executing.set_point(0.201)
     patient = PlanRuntime(planner, planner.robot.home, max_step=9.0, history=0.25)
@@ -340,9 +341,9 @@ def test_steps_above_the_stated_one_are_refused_and_change_nothing(planner, exec
 )
 def test_descending_times_booleans_and_nan_are_refused(executing, time):
     for evaluate in (executing.set_point, executing.state_at):
-        with pytest.raises(UsageError, match=r"^time must"):
+        with is_refused(UsageError, argument="time"):
             evaluate(time)
-    with pytest.raises(UsageError, match="at must be a finite number"):
+    with is_refused(UsageError, argument="at"):
         executing.stop(True)
 
 

@@ -28,6 +28,7 @@ from tests.addons.scene_files.test_requests import (
     scene_of,
 )
 from tests.examples.example_robots import needs_robots
+from tests.refusals import is_refused
 
 pytestmark = needs_robots
 
@@ -107,7 +108,7 @@ def empty_start() -> dict[str, Any]:
 
 
 def test_an_empty_start_state_needs_the_present_one(tmp_path, robot):
-    with pytest.raises(SceneError, match="give it by --start"):
+    with is_refused(SceneError):
         scene_of(tmp_path, empty_start())
     present = dict(zip(JOINTS, START, strict=True))
     scene = scene_of(tmp_path, empty_start(), present=present)
@@ -164,7 +165,7 @@ def test_mesh_files_are_read_below_the_scene_and_the_packages(tmp_path):
         ).obstacles
         corners = corners_of(obstacle.mesh)
         np.testing.assert_allclose(np.ptp(corners, axis=0), 0.1, atol=1e-6)
-    with pytest.raises(SceneError, match="give --packages"):
+    with is_refused(SceneError):
         scene_of(tmp_path, with_mesh(address))
 
 

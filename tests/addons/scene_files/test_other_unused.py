@@ -22,6 +22,7 @@ from cnpgen.scenes import (
     solve_scenes,
 )
 from tests.examples.example_robots import needs_robots
+from tests.refusals import is_refused
 
 START = [0.0, -0.785, 0.0, -2.356, 0.0, 1.571, 0.785]
 POSE = [0.5, 0.0, 0.3, 1.0, 0.0, 0.0, 0.0]
@@ -98,9 +99,7 @@ def test_every_element_of_robometrics_files_is_used_refused_or_listed(
         assert "shelf 0" in refusal
     wrong = with_value((*place[:-1], f"{place[-1]}q"), 1)
     if place[:-1] in {(), ("goal_pose",)} or len(place) == 4:
-        with pytest.raises(
-            SceneError, match=rf"unknown element, .*{place[-1]}q \(did you mean '"
-        ):
+        with is_refused(SceneError, argument="allow_unused"):
             load(tmp_path, wrong)
         key = f"{place[-1]}q"
         assert load(tmp_path, wrong, allow_unused=[key]).request.accepted
@@ -130,7 +129,7 @@ def test_a_goal_pose_of_robometrics_names_its_frame(
 ) -> None:
     pose = {key: PROBLEM["goal_pose"][key] for key in PROBLEM["goal_pose"]}
     del pose["frame"]
-    with pytest.raises(SceneError, match="'shelf 0': goal_pose has no frame"):
+    with is_refused(SceneError):
         load(tmp_path, PROBLEM | {"goal_ik": goals, "goal_pose": pose})
 
 
@@ -142,7 +141,7 @@ def test_the_world_frame_of_robometrics_is_a_link_of_the_robot(tmp_path: Path) -
     usual = load(tmp_path, with_value(("world_frame",), ""))
     assert placed_scene(scene, robot, start).obstacles == usual.obstacles
     other = load(tmp_path, with_value(("world_frame",), "table"))
-    with pytest.raises(SceneError, match="in the frame 'table', which the robot lacks"):
+    with is_refused(SceneError):
         placed_scene(other, robot, start)
 
 
@@ -161,7 +160,7 @@ def test_frames_of_links_need_a_start_of_the_robot(
 @needs_robots
 def test_an_empty_start_in_a_file_is_refused(tmp_path: Path) -> None:
     scene = load(tmp_path, with_value(("start",), []) | {"goal_ik": [[]]})
-    with pytest.raises(SceneError, match="has 0 joint positions at the start"):
+    with is_refused(SceneError):
         solve_scenes("panda", [scene])
 
 
@@ -172,7 +171,7 @@ def test_a_goal_pose_beside_goal_states_is_listed_and_names_a_frame(
     caplog.set_level("INFO", "cnpgen")
     scene = load(tmp_path, with_value(("goal_pose", "frame"), "panda_hnd"))
     assert "not used: goal_pose" in caplog.text
-    with pytest.raises(SceneError, match="the robot has no frame 'panda_hnd'"):
+    with is_refused(SceneError):
         solve_scenes("panda", [scene])
 
 
@@ -197,9 +196,7 @@ def test_unknown_datasets_of_hdf5_files_are_refused(
     caplog.set_level("INFO", "cnpgen")
     usual = [digest(scene) for scene in load_scenes(hdf5(tmp_path))]
     file = hdf5(tmp_path, cilinder_radii=np.ones((2, 1)))
-    with pytest.raises(
-        SceneError, match=r"cilinder_radii \(did you mean 'cylinder_radii'"
-    ):
+    with is_refused(SceneError, argument="allow_unused"):
         load_scenes(file)
     scenes = load_scenes(file, allow_unused=["cilinder_radii"])
     assert scenes[0].request.accepted == ("cilinder_radii",)
@@ -227,12 +224,12 @@ def test_a_part_of_the_datasets_of_a_kind_is_refused(tmp_path: Path, lost: str) 
     assert len(load_scenes(file)[0].obstacles) == 2
     with h5py.File(file, "a") as content:
         del content[lost]
-    with pytest.raises(SceneError, match=rf"scenes\.h5 lacks {lost}$"):
+    with is_refused(SceneError):
         load_scenes(file)
 
 
 def test_centers_without_radii_are_refused(tmp_path: Path) -> None:
-    with pytest.raises(SceneError, match="lacks sphere_radii"):
+    with is_refused(SceneError):
         load_scenes(hdf5(tmp_path, sphere_centers=np.full((2, 1, 3), 0.5)))
 
 
@@ -241,7 +238,7 @@ def test_a_part_of_a_file_has_equal_numbers_of_rows_too(
     tmp_path: Path, name: str
 ) -> None:
     rows = np.full((3, 1, 3), 0.1) if name == "cuboid_dims" else np.ones((3, 7))
-    with pytest.raises(SceneError, match=rf"{name} must have shape \(2, .*got \(3, "):
+    with is_refused(SceneError):
         load_scenes(hdf5(tmp_path, **{name: rows}), n=2)
 
 
@@ -250,7 +247,7 @@ def test_attributes_of_datasets_are_refused(tmp_path: Path, name: str) -> None:
     file = hdf5(tmp_path)
     with h5py.File(file, "a") as content:
         content[name].attrs["unit"] = "mm"
-    with pytest.raises(SceneError, match=rf"unknown element, {name}\.unit"):
+    with is_refused(SceneError, argument="allow_unused"):
         load_scenes(file)
     scenes = load_scenes(file, allow_unused=["unit"])
     assert scenes[0].request.accepted == (f"{name}.unit",)
@@ -260,5 +257,5 @@ def test_observations_need_one_frame(tmp_path: Path) -> None:
     scene = load(tmp_path, PROBLEM)
     assert observe([scene], "tokens")["mask"].sum() == 3
     request = replace(scene.request, obstacle_frames=("a", "b", ""))
-    with pytest.raises(UsageError, match="has obstacles in several frames"):
+    with is_refused(UsageError, argument="scenes"):
         observe([replace(scene, request=request)], "tokens")

@@ -26,6 +26,7 @@ from tests.addons.scene_files.moveit_messages import document
 from tests.addons.scene_files.test_moveit_unused import OTHER, changed
 from tests.conftest import needs_compiler
 from tests.examples.example_robots import needs_robots
+from tests.refusals import is_refused
 
 pytestmark = needs_robots
 
@@ -149,7 +150,7 @@ def test_the_placement_of_the_base_moves_the_world(tmp_path, robot):
     ]
     np.testing.assert_allclose(positions, [[0.6, 0, 0.3]] * 3, atol=1e-12)
     base["rotation"] = [half, 0, 0, half]
-    with pytest.raises(SceneError, match="tilts the base"):
+    with is_refused(SceneError):
         scene_of(tmp_path, content)
 
 
@@ -214,10 +215,10 @@ def test_goal_tolerances_move_goals_into_the_limits(tmp_path, robot):
     scene = scene_of(tmp_path, content)
     assert goal_states(scene, robot)[0, 0] == upper
     goal[0]["tolerance_below"] = 0.05
-    with pytest.raises(SceneError, match=r"panda_joint1 is .* outside of its limits"):
+    with is_refused(SceneError):
         goal_states(scene_of(tmp_path, content), robot)
     goal[0] = {"joint_name": JOINTS[0], "position": 0.5, "tolerance_above": -0.1}
-    with pytest.raises(SceneError, match="tolerance_above must be finite and not neg"):
+    with is_refused(SceneError):
         scene_of(tmp_path, content)
 
 
@@ -234,13 +235,13 @@ def test_start_velocities_reach_the_boundary_conditions(tmp_path):
     scene = scene_of(tmp_path, request(start_state=state))
     plans = scene_plans(robot_problem(), [scene])
     np.testing.assert_array_equal(plans.boundary.start_dq, [speeds[6::-1]])
-    with pytest.raises(SceneError, match="start velocity, tolerances"):
+    with is_refused(SceneError):
         save_scenes(tmp_path / "other", [scene])
     state["joint_state"]["velocity"][-1] = 0.1
-    with pytest.raises(SceneError, match="'panda_finger_joint1' moves at the start"):
+    with is_refused(SceneError):
         scene_plans(robot_problem(), [scene_of(tmp_path, request(start_state=state))])
     state["joint_state"]["velocity"] = [0.1]
-    with pytest.raises(SceneError, match="one finite velocity for each name"):
+    with is_refused(SceneError):
         scene_of(tmp_path, request(start_state=state))
 
 
@@ -252,7 +253,7 @@ def test_a_goal_of_a_joint_that_is_not_planned_must_be_its_start(tmp_path, robot
     }
     goal = {"joint_name": "panda_finger_joint1", "position": 0.0}
     content["goal_constraints"][0]["joint_constraints"].append(goal)
-    with pytest.raises(SceneError, match="moves the joint 'panda_finger_joint1' from"):
+    with is_refused(SceneError):
         goal_states(scene_of(tmp_path, content), robot)
     goal["tolerance_above"] = 0.05
     assert len(goal_states(scene_of(tmp_path, content), robot)) == 1
@@ -290,9 +291,9 @@ def test_scenes_of_one_call_share_a_problem(tmp_path, robot):
         placed(scene_of(tmp_path, request(max_velocity_scaling_factor=factor)), robot)
         for factor in (0.5, 0.6)
     ]
-    with pytest.raises(SceneError, match="other scaling factors, attached objects"):
+    with is_refused(SceneError, argument="first"):
         requested_problem(robot_problem(), robot, scenes)
-    with pytest.raises(SceneError, match="solve_scenes changes the problem"):
+    with is_refused(SceneError):
         scene_plans(robot_problem(), scenes[:1])
 
 
@@ -383,14 +384,14 @@ def test_an_unknown_weight_is_given_by_payload(tmp_path, robot):
         sum(each.mass for each in item.model.inertias) for item in (robot, carrying)
     ]
     assert mass[1] - mass[0] == pytest.approx(1.5)
-    with pytest.raises(UsageError, match="payload must be"):
+    with is_refused(UsageError, argument="payload"):
         changed_problem(tmp_path, content, robot, payload=-5.0)
 
 
 def test_attached_objects_need_link_geometry(tmp_path, robot):
     scene = placed(scene_of(tmp_path, request(start_state=stick())), robot)
     problem = cnpgen.load_problem("heavy-object")
-    with pytest.raises(SceneError, match="has no link geometry"):
+    with is_refused(SceneError):
         requested_problem(problem, load_robot(problem), [scene])
 
 
@@ -482,7 +483,7 @@ def test_defaults_of_allowed_collisions(tmp_path, robot):
     ):
         with pytest.raises(SceneError, match=f"matrix is '{text}"):
             read(names, values, **entries)
-    with pytest.raises(SceneError, match="names the link 'panda_link_5', which the"):
+    with is_refused(SceneError):
         placed(read(["panda_link_5"], [True]), robot)
 
 
@@ -512,9 +513,9 @@ def test_an_object_that_links_may_touch_becomes_a_link_of_the_base(tmp_path, rob
     np.testing.assert_allclose(
         [part.vertices.min(axis=0), part.vertices.max(axis=0)], corners, atol=1e-9
     )
-    with pytest.raises(SceneError, match="attached objects, allowed collisions"):
+    with is_refused(SceneError):
         scene_plans(robot_problem(), [scene_of(tmp_path, content)])
-    with pytest.raises(SceneError, match="are not written"):
+    with is_refused(SceneError):
         save_scenes(tmp_path / "other", [scene_of(tmp_path, content)])
 
 
@@ -559,7 +560,7 @@ def test_padding_and_scale_enlarge_links_for_obstacles_only(tmp_path, robot):
     }
     sizes = {"link_padding": [{"link_name": "hnd", "padding": 0.02}]}
     unknown = scene_of(tmp_path, request(**sizes))
-    with pytest.raises(SceneError, match="a padding or scale names the link 'hnd'"):
+    with is_refused(SceneError):
         placed(unknown, robot)
 
 
@@ -761,5 +762,5 @@ def test_elements_that_are_not_used_do_not_change_plans_and_verdicts(tmp_path):
 def test_a_matrix_that_allows_and_forbids_a_pair_is_refused(tmp_path: Path) -> None:
     content = matrix(("post", "panda_link5"))
     content["entry_values"][1] = [False] * len(content["entry_names"])
-    with pytest.raises(SceneError, match="allows and forbids post and panda_link5"):
+    with is_refused(SceneError):
         scene_of(tmp_path, request() | {"allowed_collision_matrix": content})

@@ -22,6 +22,7 @@ from cnpgen.robots.shape.hull import CUBE
 from cnpgen.robots.solid import place_obstacles, solids_of
 from cnpgen.scenes import SceneError, SceneProblem, load_scenes, make_mesh, save_scenes
 from tests.examples.scene_files import REQUEST, ROBOMETRICS, SCENE
+from tests.refusals import is_refused
 
 pytest.importorskip("yaml")
 
@@ -228,11 +229,11 @@ def test_writers_refuse_scenes_that_a_format_cannot_hold(tmp_path: Path) -> None
         name="pill", kind="capsule", position=(0.5, 0.0, 0.5), radius=0.1, length=0.2
     )
     scene = replace(example(), obstacles=(capsule,))
-    with pytest.raises(SceneError, match="'pill' is a capsule"):
+    with is_refused(SceneError):
         save_scenes(tmp_path / "scenes.h5", [scene])
-    with pytest.raises(SceneError, match="'pill' is a capsule"):
+    with is_refused(SceneError):
         save_scenes(tmp_path / "scenes", [scene], joints=JOINTS)
-    with pytest.raises(CnpgenError, match=r"\.txt must end in"):
+    with is_refused(CnpgenError, argument="path"):
         save_scenes(tmp_path / "scenes.txt", [example()])
 
 
@@ -274,18 +275,16 @@ def test_requests_must_fit_the_joints(tmp_path: Path) -> None:
         scene0001=SCENE,
         request0001=REQUEST.replace("position: 1.5e0", "position: nan"),
     )
-    with pytest.raises(
-        SceneError, match="goal has joint positions that are not finite"
-    ):
+    with is_refused(SceneError):
         load_scenes(tmp_path)
     write(
         tmp_path,
         request0001=REQUEST.replace("joint_name: panda_joint2", "joint_name: elbow"),
     )
-    with pytest.raises(SceneError, match="joint 'elbow'"):
+    with is_refused(SceneError):
         load_scenes(tmp_path)
     (tmp_path / "request0001.yaml").unlink()
-    with pytest.raises(SceneError, match="has no request"):
+    with is_refused(SceneError):
         load_scenes(tmp_path)
 
 
@@ -376,16 +375,14 @@ def test_too_many_obstacles_are_refused_before_they_are_built(tmp_path: Path) ->
         scene0001="world:\n  collision_objects:" + 2000 * entry,
         request0001=REQUEST,
     )
-    with pytest.raises(
-        SceneError, match=r"scene '0001' has 2,000 obstacles, expected at most 100"
-    ):
+    with is_refused(SceneError):
         load_scenes(tmp_path)
     with h5py.File(tmp_path / "many.h5", "w") as file:
         file["cuboid_dims"] = np.ones((1, 1_000_000, 3), "f4")
         file["cuboid_centers"] = np.ones((1, 1_000_000, 3), "f4")
         file["cuboid_quaternions"] = np.ones((1, 1_000_000, 4), "f4")
         file["start_q"] = file["goal_q"] = np.zeros((1, 7))
-    with pytest.raises(SceneError, match=r"scene '0' has 1,000,000 obstacles"):
+    with is_refused(SceneError):
         load_scenes(tmp_path / "many.h5")
 
 
@@ -433,7 +430,7 @@ def test_invalid_hdf5_scenes_are_refused(
 def test_documents_of_a_million_brackets_are_refused(tmp_path: Path) -> None:
     for text in ("[" * 1_000_000, "- " * 100_000, "{a: " * 100_000):
         (tmp_path / "deep.yaml").write_text(text)
-        with pytest.raises(SceneError, match=r"deep\.yaml"):
+        with is_refused(SceneError):
             load_scenes(tmp_path / "deep.yaml")
 
 
@@ -450,5 +447,5 @@ def test_obstacles_at_the_base_may_be_plates_below_it() -> None:
         return replace(example(), obstacles=(box,))
 
     assert checked_scene(plate(0.005)).obstacles
-    with pytest.raises(SceneError, match=r"at a depth of 0\.02 m"):
+    with is_refused(SceneError):
         checked_scene(plate(0.02))

@@ -11,6 +11,7 @@ from cnpgen.cli.main import main
 from cnpgen.errors import UsageError
 from cnpgen.trajectories import LoadOptions, load_trajectories
 from tests.addons.trajectories.test_table_columns import BACKWARDS, DQ, Q, T
+from tests.refusals import is_refused
 
 rosbag2 = pytest.importorskip("rosbags.rosbag2")
 rosbag1 = pytest.importorskip("rosbags.rosbag1")
@@ -115,12 +116,12 @@ def test_one_of_several_topics_is_named(
 ) -> None:
     topics = {"/joint_states": states(shuffled()), "/plan": (PLAN, [trajectory()])}
     path = write(tmp_path / "bag", topics, "mcap")
-    with pytest.raises(UsageError, match=r"/joint_states \(JointState\), /plan"):
+    with is_refused(UsageError, argument="topic"):
         load_trajectories(path, "airhockey")
-    with pytest.raises(UsageError, match="did you mean '/plan'"):
+    with is_refused(UsageError, argument="topic"):
         load_trajectories(path, "airhockey", options=LoadOptions(topic="/plam"))
     np.savez(tmp_path / "rows.npz", t=T, q=Q)
-    with pytest.raises(UsageError, match=r"^topic is for bags of ROS, got .*rows\.npz"):
+    with is_refused(UsageError, argument="topic"):
         load_trajectories(
             tmp_path / "rows.npz", "airhockey", options=LoadOptions(topic="/plan")
         )
@@ -132,16 +133,16 @@ def test_one_of_several_topics_is_named(
 def test_bags_without_trajectories_or_times_are_refused(tmp_path: Path) -> None:
     text = of("std_msgs/msg/String", data="x")
     path = write(tmp_path / "a", {"/text": ("std_msgs/msg/String", [text])}, "mcap")
-    with pytest.raises(UsageError, match=r"no trajectories, only /text"):
+    with is_refused(UsageError, argument="path"):
         load_trajectories(path, "airhockey")
     kind, messages = states(shuffled())
     for message in messages:
         message.header.stamp.sec = message.header.stamp.nanosec = 0
     path = write(tmp_path / "b", {"/joint_states": (kind, messages)}, "db3")
-    with pytest.raises(UsageError, match="all stamps are equal"):
+    with is_refused(UsageError, argument="path"):
         load_trajectories(path, "airhockey")
     (tmp_path / "damaged.mcap").write_bytes(b"\x89MCAP0\r\n" + bytes(100))
-    with pytest.raises(UsageError, match="is not a bag, or is damaged"):
+    with is_refused(UsageError, argument="path"):
         load_trajectories(tmp_path / "damaged.mcap", "airhockey")
 
 
@@ -151,7 +152,7 @@ def test_a_bag_has_as_many_messages_as_it_states(tmp_path: Path) -> None:
     text = metadata.read_text()
     assert "message_count: 1\n" in text
     metadata.write_text(text.replace("message_count: 1\n", "message_count: 2\n"))
-    with pytest.raises(UsageError, match=r"states 2 messages of /plan, and holds 1"):
+    with is_refused(UsageError, argument="path"):
         load_trajectories(path, "airhockey")
 
 

@@ -14,6 +14,7 @@ from cnpgen.cli.main import main
 from cnpgen.errors import UsageError
 from cnpgen.trajectories import LoadOptions, load_trajectories
 from tests.addons.trajectories.test_table_columns import BACKWARDS, DQ, Q, T
+from tests.refusals import is_refused
 
 JOINTS = BACKWARDS[::-1]
 HEAD = ["t", *JOINTS, *(f"{joint}_velocity" for joint in JOINTS)]
@@ -188,7 +189,7 @@ def test_elements_of_messages(
 def test_the_loss_of_an_element_is_accepted_by_name(tmp_path: Path) -> None:
     path = tmp_path / "a.json"
     path.write_text(json.dumps(MESSAGE | {"velocity_scaling": 0.5}))
-    with pytest.raises(UsageError, match=r"velocity_scaling.*allow_unused"):
+    with is_refused(UsageError, argument="allow_unused"):
         load_trajectories(path, "airhockey")
     options = LoadOptions(allow_unused=("velocity_scaling",))
     loaded = load_trajectories(path, "airhockey", options=options)
@@ -274,7 +275,7 @@ def test_positions_of_joints_that_are_not_planned(tmp_path: Path) -> None:
     head = ",".join(HEAD[:7])
     np.savetxt(folder / "plan_0.csv", rows, "%.17g", ",", header=head, comments="")
     (folder / "held_joints.yaml").write_text('"joint_7": 0.2\n')
-    with pytest.raises(UsageError, match=r"'joint_7' is held at 0\.2"):
+    with is_refused(UsageError, argument="path"):
         load_trajectories(folder, "airhockey")
 
 
@@ -308,7 +309,7 @@ def test_a_unit_is_refused_where_all_columns_state_theirs(
     rows = np.column_stack([T, Q])
     path = tmp_path / "a.csv"
     np.savetxt(path, rows, "%.17g", ",", header=head, comments="")
-    with pytest.raises(UsageError, match="unit is for columns without a unit"):
+    with is_refused(UsageError, argument="unit"):
         load_trajectories(path, "airhockey", options=LoadOptions(unit=unit))
     head = head.replace("joint_2 [rad]", "joint_2")
     np.savetxt(path, rows, "%.17g", ",", header=head, comments="")
@@ -349,5 +350,5 @@ def test_attributes_of_the_names_of_joints_are_refused_or_listed(
         loaded = load_trajectories(path, "airhockey")
         assert loaded.ignored == ("attribute note of joint_names",)
         return
-    with pytest.raises(UsageError, match=f"attribute {name} of joint_names"):
+    with is_refused(UsageError, argument="path"):
         load_trajectories(path, "airhockey")

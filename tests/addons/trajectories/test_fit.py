@@ -13,6 +13,7 @@ from cnpgen.trajectory.boundary import Boundary, assemble
 from cnpgen.trajectory.spline_motion import Motion
 from cnpgen.trajectory.trajectory_spec import TrajectorySpec
 from tests.conftest import some
+from tests.refusals import is_refused
 
 SPEC = TrajectorySpec()
 Curve = Callable[[np.ndarray], np.ndarray]
@@ -296,13 +297,11 @@ def test_invalid_samples_raise_an_error(
 def test_a_boundary_of_a_wrong_shape_raises_an_error() -> None:
     t = np.linspace(0, 1, 20)
     q = np.zeros((20, 3))
-    with pytest.raises(
-        UsageError, match=r"start_q must have shape \(1, 3\), got \(1, 2\)"
-    ):
+    with is_refused(UsageError, argument="boundary"):
         fit_motion(t, q, spec=SPEC, boundary=at_rest(np.zeros((2, 2))))
-    with pytest.raises(UsageError, match="start_q must be finite"):
+    with is_refused(UsageError, argument="boundary"):
         fit_motion(t, q, spec=SPEC, boundary=at_rest(np.full((2, 3), np.nan)))
-    with pytest.raises(UsageError, match="boundary must be an array of numbers"):
+    with is_refused(UsageError, argument="boundary"):
         fit_motion(
             t,
             q,

@@ -17,6 +17,7 @@ from cnpgen.plans.exporter import sample_plan
 from cnpgen.trajectories import Trajectory, import_trajectories, largest_error
 from tests.examples.plan_files import plans_of
 from tests.examples.plans import PROBLEMS, ROBOTS, load
+from tests.refusals import is_refused
 
 
 def positions(plans: Plans, rate: float, noise: float = 0.0) -> Trajectory:
@@ -169,9 +170,9 @@ def test_a_path_that_no_number_of_control_points_meets_is_named_with_exit_code_1
 
 
 def test_no_trajectories_and_other_numbers_of_joints_are_refused() -> None:
-    with pytest.raises(UsageError, match="no trajectories"):
+    with is_refused(UsageError, argument="trajectories"):
         import_trajectories("airhockey", [])
-    with pytest.raises(UsageError, match="has 2 joints, the problem plans 6"):
+    with is_refused(UsageError, argument="trajectories"):
         import_trajectories(
             "airhockey", [Trajectory(np.array([0.0, 1.0]), np.zeros((2, 2)))]
         )

@@ -4,6 +4,7 @@ import json
 from dataclasses import fields
 from pathlib import Path
 from typing import Any
+from unittest.mock import ANY
 
 import h5py
 import numpy as np
@@ -17,6 +18,7 @@ from cnpgen.trajectories import (
     Trajectory,
     load_trajectories,
 )
+from tests.refusals import is_refused
 
 READING = {entry.name for entry in fields(LoadOptions)}
 HOME = np.array([-0.3, 0.6975, 0, -0.5049, 0, 1.9286])
@@ -95,38 +97,34 @@ def test_two_lists_of_names_in_hdf5_that_differ_are_refused(tmp_path: Path) -> N
         file["t"], file["q"] = T, Q
         file.attrs["joint_names"] = BACKWARDS
         file["joint_names"] = np.array(BACKWARDS[::-1], dtype="S8")
-    with pytest.raises(UsageError, match="joint_names differ: joint_6"):
+    with is_refused(UsageError, argument="path"):
         loaded(tmp_path / "names.h5")
 
 
 def test_names_that_are_no_texts_are_refused(tmp_path: Path) -> None:
     with h5py.File(tmp_path / "names.h5", "w") as file:
         file["t"], file["q"], file["joint_names"] = T, Q, np.arange(6)
-    with pytest.raises(UsageError, match="joint_names must be a list of texts"):
+    with is_refused(UsageError, argument="path"):
         loaded(tmp_path / "names.h5")
 
 
 def test_repeated_names_are_refused_everywhere(tmp_path: Path) -> None:
     path = table(tmp_path / "j.csv", ["t", *NAMES], T, Q)
     for option in ("joints", "velocities"):
-        with pytest.raises(
-            UsageError, match="different names, got 'q5' more than once"
-        ):
+        with is_refused(UsageError, argument=ANY):
             loaded(path, **{option: ["q1", "q2", "q3", "q4", "q5", "q5"]})
     np.savez(tmp_path / "a.npz", t=T, q=Q, joint_names=[*BACKWARDS[:5], "joint_6"])
-    with pytest.raises(UsageError, match="'joint_6' is there more than once"):
+    with is_refused(UsageError, argument="path"):
         loaded(tmp_path / "a.npz")
     units = ["t", "q1 [rad]", "q1 [deg]", *NAMES[1:]]
     path = table(tmp_path / "units.csv", units, T, Q[:, 0], Q)
-    with pytest.raises(
-        UsageError, match=r"'q1 \[rad\]' and 'q1 \[deg\]' have one name"
-    ):
+    with is_refused(UsageError, argument="path"):
         loaded(path)
 
 
 def test_seven_numbers_for_six_joints_are_ambiguous(tmp_path: Path) -> None:
     path = table(tmp_path / "a.csv", ["t", "q0", *NAMES], T, Q[:, 0], Q)
-    with pytest.raises(UsageError, match="7 columns from 'q0' to 'q6' for 6 joints"):
+    with is_refused(UsageError, argument="path"):
         loaded(path)
     assert np.array_equal(only(path, joints=NAMES).q, Q)
 
@@ -135,7 +133,7 @@ def test_seven_numbers_for_six_joints_are_ambiguous(tmp_path: Path) -> None:
 def test_the_head_of_numpy_is_a_comment(tmp_path: Path, comment: str) -> None:
     path = table(tmp_path / "hash.csv", ["t", *NAMES], T / 2, Q, comment=comment)
     assert only(path).duration == pytest.approx(0.3)
-    with pytest.raises(UsageError, match="must agree with the times of the file"):
+    with is_refused(UsageError, argument="rate"):
         loaded(path, rate=100)
 
 
@@ -152,7 +150,7 @@ def test_columns_without_a_head_are_times_and_joints_or_numbers(tmp_path: Path) 
     assert np.array_equal(only(path).q, Q)
     assert np.array_equal(only(path).t, T)
     np.savetxt(path, np.column_stack([Q, T, DQ]), fmt="%.17g")
-    with pytest.raises(UsageError, match="13 columns without a head, expected 7"):
+    with is_refused(UsageError, argument="joints"):
         loaded(path)
     numbers = [str(k) for k in range(13)]
     found = only(path, joints=numbers[:6], time="6", velocities=numbers[7:])
@@ -174,16 +172,16 @@ def test_columns_of_other_programs_are_named_by_options(tmp_path: Path) -> None:
     found = only(path, joints=positions, velocities=velocities, time="stamp [us]")
     assert np.allclose(found.t, T)
     assert np.array_equal(found.dq, DQ)
-    with pytest.raises(UsageError, match=r"no column 'stmp'.*did you mean 'stamp'"):
+    with is_refused(UsageError, argument="time"):
         loaded(path, joints=positions, time="stmp")
 
 
 def test_a_rate_is_proposed_only_if_no_column_can_be_a_time(tmp_path: Path) -> None:
     path = table(tmp_path / "a.csv", ["stamp", *NAMES], T, Q)
-    with pytest.raises(UsageError, match="stamp increases as times do, time='stamp'"):
+    with is_refused(UsageError, argument="time"):
         loaded(path)
     path = table(tmp_path / "b.csv", ["row", *NAMES], np.arange(len(T)), Q)
-    with pytest.raises(UsageError, match="state rate=100"):
+    with is_refused(UsageError, argument="rate"):
         loaded(path)
 
 
@@ -196,7 +194,7 @@ def test_times_that_may_be_in_two_units_are_refused(
         q = Q.copy()
         q[-10:, 5] += glitch
         path = table(tmp_path / "a.csv", ["t", *NAMES], factor * t, q)
-        with pytest.raises(UsageError, match=f"or 't \\[{unit}\\]', or pass"):
+        with is_refused(UsageError, argument="path"):
             loaded(path)
     assert np.allclose(only(path, time=f"t [{unit}]").t, t)
     path = table(tmp_path / "b.csv", [f"t [{unit}]", *NAMES], factor * t, Q)
@@ -210,9 +208,9 @@ def test_velocities_decide_the_units_of_all_columns(tmp_path: Path) -> None:
         return table(tmp_path / "a.csv", ["t", *NAMES, *words], t * T, q * Q, dq * DQ)
 
     assert only(path_of(1, 1, 1)).duration == pytest.approx(0.6)
-    with pytest.raises(UsageError, match="as with times in ms"):
+    with is_refused(UsageError, argument="path"):
         loaded(path_of(1e3, 1, 1))
-    with pytest.raises(UsageError, match="as with velocities in deg/s"):
+    with is_refused(UsageError, argument="path"):
         loaded(path_of(1, 1, 180 / np.pi))
     slow = path_of(1e3, 1, 1e-3)  # a motion of ten minutes
     assert only(slow).duration == pytest.approx(600)
@@ -221,7 +219,7 @@ def test_velocities_decide_the_units_of_all_columns(tmp_path: Path) -> None:
 def test_repeated_rows_are_dropped_on_request(tmp_path: Path) -> None:
     rows = np.repeat(np.arange(len(T)), np.where(np.arange(len(T)) % 7 == 3, 2, 1))
     path = table(tmp_path / "a.csv", ["t", *NAMES], T[rows], Q[rows])
-    with pytest.raises(UsageError, match="increas"):
+    with is_refused(UsageError, argument="path"):
         loaded(path)
     found = loaded(path, drop_repeats=True)
     assert np.array_equal(found.trajectories[0].q, Q)
@@ -229,9 +227,7 @@ def test_repeated_rows_are_dropped_on_request(tmp_path: Path) -> None:
     q = Q[rows]
     q[4] += 1e-3
     path = table(tmp_path / "b.csv", ["t", *NAMES], T[rows], q)
-    with pytest.raises(
-        UsageError, match="the time of the row before and other positions"
-    ):
+    with is_refused(UsageError, argument="path"):
         loaded(path, drop_repeats=True)
 
 
@@ -287,9 +283,7 @@ def test_a_stream_in_which_joints_come_and_go_is_refused(tmp_path: Path) -> None
     messages = states([[0, 1, 2, 3, 4, 5]] * 4)
     messages[2]["name"][0] = "finger"
     (tmp_path / "a.json").write_text(json.dumps(messages))
-    with pytest.raises(
-        UsageError, match=r"\[2\]: joint 'finger' is not in every message"
-    ):
+    with is_refused(UsageError, argument="path"):
         loaded(tmp_path / "a.json")
 
 
@@ -326,11 +320,11 @@ def test_messages_around_a_trajectory_are_read(
 def test_failed_responses_and_motions_of_a_base_are_refused(tmp_path: Path) -> None:
     path, message = tmp_path / "a.json", {"joint_trajectory": trajectory_message()}
     path.write_text(json.dumps({"trajectory": message, "error_code": {"val": -1}}))
-    with pytest.raises(UsageError, match="error_code is -1, expected 1"):
+    with is_refused(UsageError, argument="path"):
         loaded(path)
     base = {"points": [{"transforms": []}]}
     path.write_text(json.dumps(message | {"multi_dof_joint_trajectory": base}))
-    with pytest.raises(UsageError, match="the base of the robot must not move"):
+    with is_refused(UsageError, argument="path"):
         loaded(path)
 
 
@@ -343,7 +337,7 @@ def test_attributes_that_change_the_meaning_of_numbers_are_refused(
         file["t"], file["q"] = T, Q
         file["q"].attrs[name] = 2.0
         file["q"].attrs["comment"] = "harmless"
-    with pytest.raises(UsageError, match=f"'attribute {name} of q' is not used"):
+    with is_refused(UsageError, argument="path"):
         loaded(path)
     found = load_trajectories(
         path, "airhockey", options=LoadOptions(allow_unused=(name,))

@@ -11,6 +11,7 @@ import pytest
 from cnpgen.addons.trajectories import parquet_tables, text_tables, trajectory_tables
 from cnpgen.addons.trajectories.trajectory_tables import read_trajectory_tables
 from cnpgen.errors import UsageError
+from tests.refusals import is_refused
 
 LONG_TEXT = 8_000_000  # characters
 
@@ -33,7 +34,7 @@ def test_repeated_long_texts_of_parquet_are_refused(tmp_path: Path) -> None:
     note = repeated("z" * LONG_TEXT, 1000)
     path = write_parquet(tmp_path / "a.parquet", t=np.arange(1000.0), note=note)
     assert path.stat().st_size < 2 * LONG_TEXT
-    with pytest.raises(UsageError, match="column 'note': 1,000 texts of 8,000,000"):
+    with is_refused(UsageError):
         read_trajectory_tables(path)
 
 
@@ -61,7 +62,7 @@ def test_values_and_bytes_of_parquet_are_counted(
     path = write_parquet(tmp_path / "a.parquet", t=np.zeros(1000), q=np.zeros(1000))
     read_trajectory_tables(path)
     monkeypatch.setattr(parquet_tables, name, limit)
-    with pytest.raises(UsageError, match=r"holds 2,000 values in [\d,]+ bytes"):
+    with is_refused(UsageError):
         read_trajectory_tables(path)
 
 
@@ -72,7 +73,7 @@ def test_a_long_text_in_a_column_of_many_is_refused(
     path.write_text("t,note\n0,x\n1,y\n2," + "z" * 1000 + "\n", encoding="utf-8")
     read_trajectory_tables(path)
     monkeypatch.setattr(text_tables, "MAX_TEXT_ARRAY_BYTES", 11_999)
-    with pytest.raises(UsageError, match="a column of 3 texts has one of 1,000"):
+    with is_refused(UsageError):
         read_trajectory_tables(path)
 
 
@@ -84,7 +85,7 @@ def test_text_files_have_a_limit_that_their_cells_fit_into(
     monkeypatch.setattr(trajectory_tables, "MAX_TEXT_TABLE_BYTES", 8)
     for name, text in (("a.csv", "t,q\n0,1\n1,2\n"), ("a.json", '{"t": [0, 1]}')):
         (tmp_path / name).write_text(text, encoding="utf-8")
-        with pytest.raises(UsageError, match="8"):
+        with is_refused(UsageError):
             read_trajectory_tables(tmp_path / name)
 
 
@@ -93,7 +94,7 @@ def test_lists_and_objects_of_json_are_counted_before_they_are_read(
 ) -> None:
     path = tmp_path / "a.json"
     path.write_text("[" + "[]," * 2_000_000 + "0]", encoding="utf-8")
-    with pytest.raises(UsageError, match="2,000,001 lists and objects, expected at"):
+    with is_refused(UsageError):
         read_trajectory_tables(path)
 
 

@@ -20,6 +20,7 @@ from cnpgen.problems.scenes.yaml_document import MAX_YAML_DEPTH, read_yaml
 from cnpgen.trajectories import Decision, LoadOptions, Trajectory, load_trajectories
 from tests.examples.plan_files import plans_of
 from tests.examples.plans import load, perturbed
+from tests.refusals import is_refused
 
 LABELS = ("hit", "replan", "transport")
 
@@ -342,10 +343,7 @@ def test_a_rate_must_agree_with_the_times_of_the_file(tmp_path: Path) -> None:
         file, "airhockey", options=LoadOptions(rate=rate)
     ).trajectories
     assert np.allclose(trajectory.t, T)
-    with pytest.raises(
-        UsageError,
-        match=r"rate must agree with the times of the file, got .*; t of .*a\.csv.* has steps",
-    ):
+    with is_refused(UsageError, argument="rate"):
         load_trajectories(file, "airhockey", options=LoadOptions(rate=2 * rate))
     without = write_csv(tmp_path / "b.csv", ["t", *JOINTS], [0 * T, *Q.T])
     (trajectory,) = load_trajectories(
@@ -556,15 +554,13 @@ def test_positions_in_degrees_are_refused_with_a_suggestion(tmp_path: Path) -> N
 def test_yaml_with_anchors_is_refused(tmp_path: Path, text: str) -> None:
     pytest.importorskip("yaml")
     (tmp_path / "anchors.yaml").write_text(text)
-    with pytest.raises(UsageError, match="expected a file without anchors"):
+    with is_refused(UsageError, argument="path"):
         load_trajectories(tmp_path / "anchors.yaml", "airhockey")
 
 
 def test_numbered_columns_of_fewer_joints_are_counted(tmp_path: Path) -> None:
     (tmp_path / "five.csv").write_text("t,q1,q2,q3,q4,q5\n0,0,0,0,0,0\n1,0,0,0,0,0\n")
-    with pytest.raises(
-        UsageError, match="5 columns with joint positions, the problem plans 6 joints"
-    ):
+    with is_refused(UsageError, argument="path"):
         load_trajectories(tmp_path / "five.csv", "airhockey")
 
 
@@ -579,7 +575,7 @@ def test_yaml_is_nested_to_the_stated_depth(tmp_path: Path, opening: str) -> Non
         return read_yaml(tmp_path / "deep.yaml")
 
     assert len(nested(MAX_YAML_DEPTH)) == 1
-    with pytest.raises(UsageError, match=f"at most {MAX_YAML_DEPTH} levels"):
+    with is_refused(UsageError):
         nested(MAX_YAML_DEPTH + 1)
 
 
@@ -595,7 +591,7 @@ def test_a_damaged_header_of_a_parquet_file_in_a_dataset_of_lerobot_is_an_error(
     for place in range(len(content) - 8 - length, len(content) - 8, 3):
         content[place] ^= 0xFF
     path.write_bytes(content)
-    with pytest.raises(UsageError, match="is not a Parquet file, or is damaged"):
+    with is_refused(UsageError, argument="path"):
         load_trajectories(tmp_path / "set", plans.problem)
 
 
@@ -604,7 +600,7 @@ def test_a_file_with_a_stack_of_no_trajectories_is_an_error(
     tmp_path: Path, unit: str
 ) -> None:
     np.savez(tmp_path / "none.npz", t=np.zeros((0, 5)), q=np.zeros((0, 5, 6)))
-    with pytest.raises(UsageError, match="holds no trajectory"):
+    with is_refused(UsageError, argument="path"):
         load_trajectories(
             tmp_path / "none.npz", "airhockey", options=LoadOptions(unit=unit)
         )
@@ -612,7 +608,7 @@ def test_a_file_with_a_stack_of_no_trajectories_is_an_error(
 
 def test_a_table_without_rows_is_an_error(tmp_path: Path) -> None:
     np.savez(tmp_path / "none.npz", t=np.zeros(0), q=np.zeros((0, 6)))
-    with pytest.raises(UsageError, match="there are no positions"):
+    with is_refused(UsageError, argument="path"):
         load_trajectories(tmp_path / "none.npz", "airhockey")
 
 
@@ -622,13 +618,13 @@ def test_names_in_a_parquet_file_that_are_no_texts_are_an_error(tmp_path: Path) 
     table, path = pyarrow.table({"a_column": [1.0, 2.0]}), tmp_path / "table.parquet"
     parquet.write_table(table, path)
     path.write_bytes(path.read_bytes().replace(b"a_column", b"a\xf4column"))
-    with pytest.raises(UsageError, match="is not a Parquet file, or is damaged"):
+    with is_refused(UsageError, argument="path"):
         load_trajectories(path, "airhockey")
     for names in (b"7", b"[", b"\xf4"):
         parquet.write_table(
             table.replace_schema_metadata({b"cnpgen_joint_names": names}), path
         )
-        with pytest.raises(UsageError, match="names of joints are no list of texts"):
+        with is_refused(UsageError, argument="path"):
             load_trajectories(path, "airhockey")
 
 

@@ -19,6 +19,7 @@ from cnpgen.robots.obstacle import Obstacle
 from cnpgen.trajectories import import_trajectories, load_trajectories
 from cnpgen.trajectory.boundary import Boundary
 from tests.examples.example_robots import needs_robots
+from tests.refusals import is_refused
 
 pytestmark = needs_robots
 
@@ -83,7 +84,7 @@ def test_one_scene_is_that_of_all_and_other_numbers_are_refused(
     loaded = load_trajectories(files[0], "panda-3kg", scenes=[scene(0.4)])
     found = cnpgen.evaluate_trajectories(loaded.problem, loaded.trajectories)
     assert found.valid.tolist() == [False, False]
-    with pytest.raises(UsageError, match="one for each of 2 trajectories, got 3"):
+    with is_refused(UsageError, argument="scenes"):
         load_trajectories(files[0], "panda-3kg", scenes=[scene(1.0)] * 3)
 
 
@@ -126,7 +127,7 @@ def test_a_dataset_of_lerobot_has_its_scenes(lines: Plans, tmp_path: Path) -> No
     assert not found.verdicts[0].valid
     decisions = [v.conditions["robot clearance"].decision for v in found.verdicts]
     assert decisions == ["invalid", "valid"]
-    with pytest.raises(UsageError, match="trajectory 0 has another scene of its own"):
+    with is_refused(UsageError, argument="scenes"):
         load_trajectories(tmp_path / "le", lines.problem, scenes=[scene(1.0)])
 
 
@@ -195,7 +196,7 @@ def test_scenes_of_other_obstacles_and_plans_without_scenes_are_refused(
         rate_control_points=np.ones((1, 20)),
     )
     cnpgen.save_plans(tmp_path / "free.h5", plans)
-    with pytest.raises(UsageError, match=r"free\.h5 has no scenes"):
+    with is_refused(UsageError, argument="scenes"):
         load_trajectories(files[0], "panda-3kg", scenes=tmp_path / "free.h5")
 
 
@@ -250,5 +251,5 @@ def test_plan_files_with_demands_that_the_problem_lacks_are_refused(
     constrained = problem.replaced(constraint=(*problem.constraint, inside))
     plans = replace(lines, problem=record_problem(constrained))
     cnpgen.save_plans(tmp_path / "plans.h5", plans)
-    with pytest.raises(UsageError, match="a constraint of the path of 'panda_hand'"):
+    with is_refused(UsageError, argument="scenes"):
         load_trajectories(files[0], "panda-3kg", scenes=tmp_path / "plans.h5")

@@ -21,6 +21,7 @@ from cnpgen.errors import MachineError, UsageError
 from cnpgen.make.draw_boundary_problems import draw_boundary_problems
 from cnpgen.plans import Plans, save_plans
 from cnpgen.refine.refine_plans import solve_plans
+from tests.refusals import is_refused
 
 pytestmark = pytest.mark.skipif(not find_spec("mujoco"), reason="needs mujoco")
 CLONE = Path(__file__).parents[3] / "examples" / "challenge"
@@ -182,20 +183,17 @@ except MachineError as error:
 
 def test_an_imported_clone_is_not_confused_with_another(tmp_path: Path) -> None:
     challenge_plant(CLONE)
-    with pytest.raises(MachineError, match="hidden by an installed copy"):
+    with is_refused(MachineError):
         challenge_plant(clone(tmp_path / "clone"))
     challenge_plant(CLONE)
 
 
 def test_other_problems_than_hits_are_refused(tmp_path: Path) -> None:
-    with pytest.raises(
-        UsageError,
-        match=r"the Air Hockey Challenge has a table .* 'heavy-object' is another problem",
-    ):
+    with is_refused(UsageError):
         simulate_plans(
             draw_boundary_problems("heavy-object", 1, seed=0), environment=CLONE
         )
-    with pytest.raises(UsageError, match="is another problem"):
+    with is_refused(UsageError):
         run_benchmark(
             "heavy-100",
             tmp_path,
@@ -210,7 +208,7 @@ def test_items_of_one_number_are_assigned_as_numbers() -> None:
     values[1] = np.array([3.0])
     values[:] = values + values
     assert values.tolist() == [0.0, 6.0]
-    with pytest.raises(ValueError, match="sequence"):
+    with is_refused(ValueError):
         values[0] = np.zeros(2)
 
 
