@@ -9,6 +9,7 @@ from cnpgen.problems.constraints.constraint import Condition as Condition
 from cnpgen.problems.constraints.constraint import Constraint as Constraint
 from cnpgen.problems.constraints.constraint import LinkConstraint as LinkConstraint
 from cnpgen.problems.objectives import ObjectiveTerm as ObjectiveTerm
+from cnpgen.robots.obstacle_shapes.obstacle_shape import ObstacleShape as ObstacleShape
 from cnpgen.schema.keys import PerJoint as PerJoint
 from cnpgen.schema.keys import Range as Range
 from cnpgen.schema.keys import field as field

@@ -451,15 +451,9 @@ def _problem_errors(robot: Robot, problem: Problem) -> Iterator[str]:
 def _distance(obstacle: Obstacle) -> float:
     """Return a lower bound of the distance of an obstacle from the origin of the world [m]."""
     if obstacle.position is not None and not obstacle.mesh:
-        # The sum of all lengths bounds the extent from the center, whatever the shape
-        # and its rotation.
-        lengths = [
-            *(obstacle.size or ()),
-            obstacle.radius or 0.0,
-            obstacle.radius or 0.0,
-            obstacle.length or 0.0,
-        ]
-        return float(np.linalg.norm(obstacle.position) - sum(lengths))
+        corners, radius = obstacle.form.polytope()
+        extent = float(np.linalg.norm(corners, axis=1).max()) + radius
+        return float(np.linalg.norm(obstacle.position)) - extent
     # Distance of the origin from a range [low, high] of one coordinate: max(low, -high,
     # 0).
     sides = [

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Mapping
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -14,6 +15,7 @@ from cnpgen.problems.constraints.clearance import RobotClearance
 from cnpgen.problems.problem import Problem
 from cnpgen.robots.observation.primitives import KINDS
 from cnpgen.robots.obstacle import Obstacle
+from cnpgen.robots.obstacle_shapes.obstacle_shape import shape_class
 from cnpgen.robots.scene import PARKED_POSITION_M, Scene
 from cnpgen.robots.solid import place_obstacles
 from cnpgen.robots.table_frame import TableFrame, table_frame
@@ -26,6 +28,7 @@ MAX_CAPACITY = 10_000  # obstacles of one kind
 Capacity = Mapping[str, int]  # kind, or corners of a mesh -> number of obstacles
 # Any rotation: boxes of scenes have rotation matrices.
 _PARKED_ROTATION = 0.1, 0.1, 0.1
+_PARKED_SIZE_M = 0.01
 
 
 def scene_of(
@@ -170,18 +173,10 @@ def _parked(kind: str, index: int) -> Obstacle:
             position=PARKED_POSITION_M,
             rotation=_PARKED_ROTATION,
         )
-    name = f"{kind} {index}"
-    small = 0.01
-    if kind == "box":
-        return Obstacle(
-            name=name,
-            kind=kind,
-            position=PARKED_POSITION_M,
-            size=(small,) * 3,
-            rotation=_PARKED_ROTATION,
-        )
-    if kind == "sphere":
-        return Obstacle(name=name, kind=kind, position=PARKED_POSITION_M, radius=small)
-    return Obstacle(
-        name=name, kind=kind, position=PARKED_POSITION_M, radius=small, length=small
+    parked = Obstacle(
+        name=f"{kind} {index}",
+        kind=kind,
+        position=PARKED_POSITION_M,
+        **shape_class(kind).with_sizes([_PARKED_SIZE_M] * 3),
     )
+    return replace(parked, rotation=_PARKED_ROTATION) if kind == "box" else parked

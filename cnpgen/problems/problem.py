@@ -481,15 +481,13 @@ class Problem:
 
     @cached_property
     def structure(self) -> str | None:
-        """Hash (sha256) as ``identity``, without names, poses and sizes of obstacles; None with plug-in constraints.
+        """Hash (sha256) as ``identity``, without names, poses and sizes of obstacles; None with plug-ins.
 
         Kernels that read these numbers from their arguments are equal for all problems
         of one structure.
         """
-        if not all(
-            type(constraint).__module__.startswith("cnpgen.")
-            for constraint in self.constraint
-        ):
+        kinds = [*self.constraint, *(obstacle.form for obstacle in self.obstacle)]
+        if not all(type(kind).__module__.startswith("cnpgen.") for kind in kinds):
             return None
         content = without_labels(to_dict(self, label=_all_of))
         # The name does not affect kernels, but is part of the identity.

@@ -22,6 +22,7 @@ from cnpgen.problems.objectives import ObjectiveTerm
 from cnpgen.problems.problem import FILES, Problem
 from cnpgen.problems.urdf_dynamics import undecided_friction
 from cnpgen.robots.obstacle import Obstacle
+from cnpgen.robots.obstacle_shapes.obstacle_shape import ObstacleShape
 from cnpgen.robots.shape.inline import inline_mesh, is_inline, mesh_files
 from cnpgen.robots.shape.mesh_files import find_named_file
 from cnpgen.schema import registry
@@ -55,6 +56,7 @@ def load_problem(
 KIND_READERS: dict[type, Reader] = {
     Constraint: partial(read_kind, registry.CONSTRAINTS),
     ObjectiveTerm: partial(read_kind, registry.OBJECTIVES),
+    ObstacleShape: partial(read_kind, registry.SHAPES),
 }
 
 
@@ -248,10 +250,16 @@ def _meshes_on_disk(
 
 
 def missing_kinds_of_problem(content: JsonObject) -> list[str]:
-    """Return the missing packages of the constraints and objective terms of a resolved problem."""
+    """Return the missing packages of the constraints, objective terms and shapes of a resolved problem."""
     objective = content.get("objective")
     terms = tables(objective, "term") if isinstance(objective, dict) else []
+    shapes = [
+        (index, obstacle["shape"])
+        for index, obstacle in tables(content, "obstacle")
+        if isinstance(obstacle.get("shape"), dict)
+    ]
     return [
+        *missing_kinds(registry.SHAPES, shapes),
         *missing_kinds(registry.CONSTRAINTS, tables(content, "constraint")),
         *missing_kinds(registry.OBJECTIVES, terms),
     ]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from copy import deepcopy
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 from xml.etree import ElementTree
 from xml.etree.ElementTree import Element, SubElement
 
@@ -13,7 +13,6 @@ import numpy as np
 from cnpgen.errors import RecipeError
 from cnpgen.robots.obstacle import Obstacle
 from cnpgen.robots.shape.convex_part import turned
-from cnpgen.robots.shape.hull import coal_hull
 from cnpgen.robots.shape.inline import address_of, corners_of
 from cnpgen.robots.urdf import numbers_text, urdf_tree
 from cnpgen.robots.urdf_changes import with_ignored_pairs
@@ -142,7 +141,7 @@ def uniform_inertia(shapes: Sequence[Obstacle], mass: float) -> pin.Inertia:
     """Return the inertia of shapes of one density, in the frame of their poses, for a total mass [kg]."""
     import pinocchio as pin
 
-    bodies = [_coal_shape(shape) for shape in shapes]
+    bodies = [shape.form.coal() for shape in shapes]
     volumes = np.array([body.computeVolume() for body in bodies])
     density = mass / volumes.sum()
     total = pin.Inertia.Zero()
@@ -156,29 +155,16 @@ def uniform_inertia(shapes: Sequence[Obstacle], mass: float) -> pin.Inertia:
     return total
 
 
-def _coal_shape(shape: Obstacle) -> Any:
-    import coal
-
-    if shape.kind == "box":
-        return coal.Box(*(shape.size or ()))
-    if shape.kind == "sphere":
-        return coal.Sphere(shape.radius)
-    if shape.kind == "cylinder":
-        return coal.Cylinder(shape.radius, shape.length)
-    return coal_hull(corners_of(shape.mesh))
-
-
 def _geometry(shape: Obstacle) -> Element:
     """Return the geometry of a shape as an element of a URDF."""
-    if shape.kind == "box":
-        return Element("box", size=numbers_text(shape.size or ()))
-    radius = numbers_text([shape.radius or 0.0])
-    if shape.kind == "sphere":
-        return Element("sphere", radius=radius)
-    if shape.kind == "cylinder":
-        length = numbers_text([shape.length or 0.0])
-        return Element("cylinder", radius=radius, length=length)
-    return Element("mesh", filename=shape.mesh)
+    tag, values = shape.form.urdf()
+    return Element(
+        tag,
+        {
+            key: value if isinstance(value, str) else numbers_text(np.ravel(value))
+            for key, value in values.items()
+        },
+    )
 
 
 def _inertial(inertia: pin.Inertia) -> Element:

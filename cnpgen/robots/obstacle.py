@@ -4,23 +4,33 @@ import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
+import numpy as np
+
 from cnpgen.arrays import Vector3
 from cnpgen.documents import NamedErrors
+from cnpgen.robots.obstacle_shapes.box import UprightBox
+from cnpgen.robots.obstacle_shapes.mesh import MeshShape
+from cnpgen.robots.obstacle_shapes.obstacle_shape import ObstacleShape, shape_class
 from cnpgen.robots.parameter_ranges import optional_key
-from cnpgen.robots.shape.hull import MAX_COORDINATE_M, check_solid
-from cnpgen.robots.shape.inline import corners_of, is_inline
+from cnpgen.robots.shape.hull import CUBE, MAX_COORDINATE_M, check_solid
+from cnpgen.robots.shape.inline import is_inline
+from cnpgen.schema import registry
 from cnpgen.schema.keys import Range, field, keys
 from cnpgen.schema.units import PLAUSIBLE_MAX, suggested_unit
 
-_KEYS = {  # kind -> keys of pose and size; those of _OPTIONAL may be omitted
-    "box": ("position", "size", "rotation"),
-    "sphere": ("position", "radius"),
-    "cylinder": ("position", "radius", "length", "rotation"),
-    "capsule": ("position", "radius", "length", "rotation"),
-    "mesh": ("position", "mesh", "rotation", "scale"),
-}
+CONVEX = "convex"  # kind of an obstacle with the shape of a package
 _UPRIGHT = ("x", "y", "top", "height")  # keys of an upright box
 _OPTIONAL = {"rotation": (0.0, 0.0, 0.0), "scale": (1.0, 1.0, 1.0)}
+_KINDS = (*registry.BUILT_IN[registry.SHAPES], CONVEX)
+_POSED = {"position", "size", "radius", "length", "mesh", "shape", *_OPTIONAL}
+
+
+def _keys_of(kind: str) -> tuple[str, ...]:
+    """Return the keys of pose and size of a kind; those of ``_OPTIONAL`` may be omitted."""
+    if kind == CONVEX:
+        return ("position", "shape", "rotation")
+    shape = shape_class(kind)
+    return ("position", *shape.sizes(), *shape.placement)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -50,9 +60,7 @@ class Obstacle:
         choices=("", "start", "goal"),
         default="",
     )
-    kind: str = optional_key(
-        "kind of the obstacle", choices=tuple(_KEYS), default="box"
-    )
+    kind: str = optional_key("kind of the obstacle", choices=_KINDS, default="box")
     position: Vector3 | None = optional_key(
         "position of the centre, for a mesh of the origin of its file: x, y, z",
         unit="m",
@@ -79,6 +87,10 @@ class Obstacle:
     scale: Vector3 = optional_key(
         "scale factors of the mesh along x, y and z", default=_OPTIONAL["scale"]
     )
+    shape: ObstacleShape | None = optional_key(
+        "shape of a package for the kind convex, and its dimensions",
+        form="a table with 'use'",
+    )
 
     def validate(self) -> NamedErrors:
         """Yield (key, error) pairs."""
@@ -86,13 +98,16 @@ class Obstacle:
 
     def value_errors(self) -> NamedErrors:
         """Yield (key, error) pairs of an obstacle that Python has built: its kind, missing keys, and numbers."""
-        if self.kind not in _KEYS:
-            yield "kind", f"must be one of {', '.join(_KEYS)}, got {self.kind!r}"
+        if self.kind not in _KINDS:
+            yield "kind", f"must be one of {', '.join(_KINDS)}, got {self.kind!r}"
             return
         for name in ("x", "y"):
             if not isinstance(getattr(self, name), Range | None):
                 yield name, f"must be a Range, got {getattr(self, name)!r}"
                 return
+        if not isinstance(self.shape, ObstacleShape | None):
+            yield "shape", f"must be an ObstacleShape, got {self.shape!r}"
+            return
         for key in keys(type(self)):
             value = getattr(self, key.name)
             ends = (value.low, value.high) if isinstance(value, Range) else value
@@ -115,6 +130,17 @@ class Obstacle:
             elif key.low is not None and numbers and min(numbers) < key.low:
                 yield key.name, f"must be at least {key.low:g} {key.unit}, got {value}"
         yield from self.validate()
+
+    @property
+    def form(self) -> ObstacleShape:
+        """The shape with its dimensions."""
+        if self.shape is not None:
+            return self.shape
+        if self.upright:
+            none = Range(0, 0)
+            return UprightBox(x=self.x or none, y=self.y or none, height=self.height)
+        shape = shape_class(self.kind)
+        return shape(**{name: getattr(self, name) for name in shape.sizes()})
 
     @property
     def upright(self) -> bool:
@@ -148,14 +174,14 @@ class Obstacle:
                     key,
                     f"obstacle {self.name!r} has no extent here, expected a low end below the high end",
                 )
-        for key in self._given(set().union(*_KEYS.values())):
+        for key in self._given(_POSED):
             yield (
                 key,
                 f"an upright box has {_listed(_UPRIGHT)}: leave this out, or give a box with a pose",
             )
 
     def _mistakes_posed(self) -> NamedErrors:
-        known = _KEYS[self.kind]
+        known = _keys_of(self.kind)
         needed = [key for key in known if key not in _OPTIONAL]
         instead = (
             f", or {_listed(_UPRIGHT)} in their place" if self.kind == "box" else ""
@@ -165,15 +191,29 @@ class Obstacle:
                 key,
                 f"obstacle {self.name!r} is a {self.kind} and needs {_listed(needed)}{instead}",
             )
-        for key in self._given(set(_UPRIGHT).union(*_KEYS.values()) - set(known)):
+        for key in self._given(_POSED.union(_UPRIGHT) - set(known)):
             yield key, f"a {self.kind} has no such key, expected {_listed(known)}"
         if 0.0 in self.scale:
             yield "scale", f"factors must not be 0, got {list(self.scale)}"
-        if is_inline(self.mesh):
-            try:
-                check_solid(corners_of(self.mesh))
-            except ValueError as error:
-                yield "mesh", str(error)
+        yield from self._mistakes_of_body()
+
+    def _mistakes_of_body(self) -> NamedErrors:
+        core = registry.BUILT_IN[registry.SHAPES]
+        if self.shape is not None:
+            name = registry.name_of(registry.SHAPES, type(self.shape))
+            if name in core:
+                yield "shape", f"is a {name}: set kind = {name!r} and its keys instead"
+                return
+        body = MeshShape(mesh=self.mesh) if is_inline(self.mesh) else self.shape
+        if body is None:
+            return
+        try:
+            corners, radius = body.polytope()
+            # A radius makes a body of points and segments, too.
+            ball = corners[:1] + radius * CUBE
+            check_solid(np.concatenate([corners, ball]) if radius else corners)
+        except ValueError as error:
+            yield "mesh" if self.mesh else "shape", str(error)
 
     def _given(self, keys: Iterable[str]) -> list[str]:
         """Return the given keys among some keys."""

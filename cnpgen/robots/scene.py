@@ -14,13 +14,13 @@ import numpy as np
 from cnpgen.arrays import AnyArray, Array
 from cnpgen.errors import UsageError, counted
 from cnpgen.robots.obstacle import Obstacle
+from cnpgen.robots.obstacle_shapes.obstacle_shape import shape_class
+from cnpgen.robots.obstacle_shapes.solid import Solid
 from cnpgen.robots.shape.hull import MAX_COORDINATE_M
 from cnpgen.robots.solid import (
-    Solid,
     number_slices,
     place_obstacles,
     pose_width,
-    posed_numbers,
     solids_of,
 )
 from cnpgen.schema.arguments import integer
@@ -250,8 +250,7 @@ def scene_poses(obstacles: Sequence[Obstacle], table: SceneTable) -> Array:
             )
         if not len(rank):
             continue
-        numbers = posed_numbers(
-            kind,
+        numbers = shape_class(kind).numbers(
             position[scenes, entries],
             size[scenes, entries],
             rotations[scenes, entries],

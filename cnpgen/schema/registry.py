@@ -29,6 +29,7 @@ READERS = "cnpgen.readers"
 ENGINES = "cnpgen.engines"
 DOCUMENTS = "cnpgen.documents"
 RULES = "cnpgen.rules"
+SHAPES = "cnpgen.shapes"
 RECIPES = "cnpgen.recipes"  # types of recipe files; they have no common base class
 # Modules with the functions of ``cnpgen.cli.parser.add_command``.
 COMMANDS = "cnpgen.commands"
@@ -45,6 +46,7 @@ CONTRACTS: dict[str, str] = {  # base class of the kinds of a group
     ENGINES: "cnpgen.machine.engine:ClusterEngine",
     DOCUMENTS: "cnpgen.store.dataset_document:DatasetDocument",
     RULES: "cnpgen.problems.published_rules:PublishedRules",
+    SHAPES: "cnpgen.robots.obstacle_shapes.obstacle_shape:ObstacleShape",
 }
 
 BUILT_IN: dict[str, dict[str, str]] = {
@@ -99,6 +101,13 @@ BUILT_IN: dict[str, dict[str, str]] = {
         "jerk": "cnpgen.problems.objectives:Jerk",
         "path-length": "cnpgen.problems.objectives:PathLength",
         "tip-reference": "cnpgen.problems.objectives:TipReference",
+    },
+    SHAPES: {
+        "box": "cnpgen.robots.obstacle_shapes.box:BoxShape",
+        "sphere": "cnpgen.robots.obstacle_shapes.sphere:SphereShape",
+        "cylinder": "cnpgen.robots.obstacle_shapes.cylinder:CylinderShape",
+        "capsule": "cnpgen.robots.obstacle_shapes.capsule:CapsuleShape",
+        "mesh": "cnpgen.robots.obstacle_shapes.mesh:MeshShape",
     },
     EXPORTERS: {
         "npz": "cnpgen.plans.formats:NumpyArchive",

@@ -12,8 +12,8 @@ from typing import Any
 import numpy as np
 
 from cnpgen.arrays import Array
+from cnpgen.robots.obstacle_shapes.solid import Solid
 from cnpgen.robots.shape.hull import coal_hull
-from cnpgen.robots.solid import Solid
 
 # Rotation matrix of shape (3, 3), and origin [m], shape (3,).
 Pose = tuple[Array, Array]

@@ -13,11 +13,12 @@ import scipy
 from cnpgen.errors import RecipeError
 from cnpgen.problems.load_robot import load_robot
 from cnpgen.problems.problem_file import load_problem
+from cnpgen.robots.obstacle_shapes.cylinder import PRISM_SIDES
 from cnpgen.robots.robot import Attached, reduced_model
 from cnpgen.robots.shape import link_pairs as pairs
 from cnpgen.robots.shape import shape as module
 from cnpgen.robots.shape.capsule import covering_capsule
-from cnpgen.robots.shape.convex_part import PRISM_SIDES, ConvexPart, link_convex_parts
+from cnpgen.robots.shape.convex_part import ConvexPart, link_convex_parts
 from cnpgen.robots.shape.hull import coal_hull, enclosing_hull, hull_corners
 from cnpgen.robots.shape.inline import corners_of, inline_mesh, with_inline_meshes
 from cnpgen.robots.shape.mesh_files import find_named_file

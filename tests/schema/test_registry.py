@@ -183,6 +183,7 @@ def test_every_group_has_a_base():
         registry.ENGINES: ClusterEngine,
         registry.DOCUMENTS: DatasetDocument,
         registry.RULES: PublishedRules,
+        registry.SHAPES: ObstacleShape,
     }
     assert registry.CONTRACTS.keys() >= registry.BUILT_IN.keys()
 

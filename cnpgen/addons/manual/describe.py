@@ -203,7 +203,10 @@ def _obstacle(obstacle: Obstacle) -> str:
     same = [
         key.name for key in keys(Obstacle) if getattr(obstacle, key.name) == key.default
     ]
-    text = numbers(obstacle, leave_out=("name", "mesh", *same))
+    text = numbers(obstacle, leave_out=("name", "mesh", "shape", *same))
+    if obstacle.shape is not None:
+        name = registry.name_of(registry.SHAPES, type(obstacle.shape))
+        return f"{text}, {name}: {numbers(obstacle.shape)}"
     return (
         f"{text}, the hull of {len(corners_of(obstacle.mesh))} corners"
         if obstacle.mesh

@@ -17,7 +17,7 @@ from cnpgen.problems.problem import Problem
 from cnpgen.robots.chain import frame_of
 from cnpgen.robots.robot import Robot
 from cnpgen.robots.shape.convex_part import convex_part_of, origin_of
-from cnpgen.robots.shape.hull import outward_triangles
+from cnpgen.robots.shape.hull import inflated, outward_triangles
 from cnpgen.robots.shape.inline import read_mesh, scale_of, sides_of
 from cnpgen.robots.shape.mesh_files import find_named_file
 from cnpgen.robots.urdf import urdf_tree
@@ -27,7 +27,6 @@ from cnpgen.robots.urdf import urdf_tree
 LINE_ARM_RADIUS_M = 0.04
 MAX_TRIANGLES = 400_000  # of all visual meshes; larger pages open slowly
 PROBE = 0.5  # joint displacement from which the axis of a joint is computed
-BALL = 12  # directions per quarter of a circle in which round bodies have corners
 
 
 @dataclass(frozen=True)
@@ -117,7 +116,7 @@ def wrapped(
 ) -> Body:
     """Return the hull of points [m], shape (V, 3), inflated by a radius [m], as triangles that face outwards."""
     # The hull of balls around all points is the inflated hull.
-    points = (corners[:, None] + radius * _ball()).reshape(-1, 3) if radius else corners
+    points = inflated(corners, radius)
     used, numbers = np.unique(outward_triangles(points), return_inverse=True)
     return Body(name, joint, points[used], numbers.reshape(-1, 3), smooth)
 
@@ -154,22 +153,6 @@ def extent(bodies: Sequence[Body], poses: Array) -> tuple[Array, Array]:
     ]
     corners = np.concatenate(parts)
     return corners.min(axis=0), corners.max(axis=0)
-
-
-def _ball() -> Array:
-    """Unit vectors along meridians and parallels, shape (N, 3)."""
-    angles = np.linspace(0, np.pi, 2 * BALL + 1)
-    # Meridians include both poles; around the circle, the last turn would repeat the
-    # first.
-    turns = np.arange(4 * BALL) * np.pi / (2 * BALL)
-    level = np.sin(angles)[:, None]
-    height = np.broadcast_to(np.cos(angles)[:, None], (len(angles), len(turns)))
-    return np.unique(
-        np.stack(
-            [level * np.cos(turns), level * np.sin(turns), height], axis=-1
-        ).reshape(-1, 3),
-        axis=0,
-    )
 
 
 def _visual_bodies(problem: Problem, robot: Robot) -> Iterator[Body]:

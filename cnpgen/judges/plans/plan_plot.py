@@ -14,9 +14,10 @@ from cnpgen.problems.constraints.joint import MotorTorques, motor_conditions
 from cnpgen.problems.constraints.table import Table
 from cnpgen.problems.obstacles import scene_of
 from cnpgen.problems.problem import Problem
+from cnpgen.robots.obstacle_shapes.solid import Solid
 from cnpgen.robots.robot import Robot
 from cnpgen.robots.scene import Scene
-from cnpgen.robots.solid import Solid, place_obstacles
+from cnpgen.robots.solid import place_obstacles
 from cnpgen.store.files.figure_file import new_figure, save_figure
 from cnpgen.trajectory.spline_motion import Motion
 from cnpgen.world.forward_kinematics import ForwardKinematics

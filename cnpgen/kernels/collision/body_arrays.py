@@ -1,6 +1,5 @@
 """Convex bodies as arrays for ``convex.c``: convex parts of links and obstacles of a sample."""
 
-import math
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
@@ -10,13 +9,11 @@ from numpy.typing import NDArray
 from cnpgen.arrays import Array
 from cnpgen.robots.observation.primitives import KINDS, MESH, Primitives
 from cnpgen.robots.obstacle import Obstacle
-from cnpgen.robots.shape.hull import frame_along
-from cnpgen.robots.shape.inline import corners_of
-from cnpgen.robots.solid import number_slices, solids_of
+from cnpgen.robots.obstacle_shapes.obstacle_shape import BOX, CYLINDER, HULL
+from cnpgen.robots.solid import number_slices
 
 Bodies = NDArray[np.void]
 
-HULL, BOX, CYLINDER = 0, 1, 2  # kinds in convex.c
 LANES = 8  # vertices and obstacles are padded to a multiple of the widest vector
 BLOCK = 16  # vertices, as in convex.c
 # Fewer vertices are found as fast without blocks; convex.c has memory for 1024 blocks.
@@ -156,9 +153,6 @@ def obstacle_bodies(
 ) -> tuple[Bodies, Array, Array]:
     """Return the obstacles of one sample as bodies.
 
-    Cylinders are exact, with the radius of the corners of the prism that judges use:
-        they contain that prism.
-
     Args:
         obstacles: Obstacles of the problem.
         numbers: Their poses and sizes, shape (width,), see ``cnpgen.robots.solid``.
@@ -175,70 +169,22 @@ def obstacle_bodies(
     for index, (obstacle, part) in enumerate(
         zip(obstacles, number_slices(obstacles), strict=True)
     ):
+        record = obstacle.form.record(numbers[part])
+        centers[index], halves[index] = record.position, record.half
         body = bodies[index]
-        centers[index], halves[index] = _fill(body, obstacle, numbers[part])
-        if body["kind"] == HULL:
-            hull = hull_vertices(corners_of(obstacle.mesh))
-            hull.put(bodies, index, first)
-            vertices.append(hull.values)
-            first += len(hull.values)
+        body["kind"] = record.kind
+        body["position"] = record.position
+        body["rotation"] = record.rotation.ravel()
+        body["radius"] = record.radius
+        if record.corners is None:
+            body["size"] = record.half
+            continue
+        # The bounding box of a hull is that of its corners in its own frame.
+        ends = record.corners.min(axis=0) + record.corners.max(axis=0)
+        centers[index] += record.rotation @ ends / 2
+        hull = hull_vertices(record.corners)
+        hull.put(bodies, index, first)
+        vertices.append(hull.values)
+        first += len(hull.values)
     (boxes,) = bounding_boxes(bodies[None], centers[None], halves[None])
     return bodies, np.concatenate([*vertices, np.empty(0)]), boxes
-
-
-def _fill(body: Any, obstacle: Obstacle, numbers: Array) -> tuple[Array, Array]:
-    """Fill in an obstacle's kind, sizes and pose.
-
-    Return center and half sizes of its bounding box without radius.
-    """
-    if not obstacle.upright:
-        return _fill_placed(body, obstacle, numbers)
-    (solid,) = solids_of([obstacle], numbers)
-    center = (solid.low + solid.high) / 2
-    half = (solid.high - solid.low) / 2
-    body["kind"] = BOX
-    body["size"] = half
-    body["position"] = center
-    body["rotation"] = np.eye(3).ravel()
-    return center, half
-
-
-def _fill_placed(body: Any, obstacle: Obstacle, numbers: Array) -> tuple[Array, Array]:
-    """Fill in an obstacle with a position and, depending on its kind, a rotation or an axis."""
-    rotation = np.eye(3)
-    half = np.zeros(3)
-    center = numbers[:3]
-    rest = numbers[3:]
-    if obstacle.kind == "box":
-        half = rest[:3]
-        rotation = rest[3:].reshape(3, 3) if obstacle.is_turned else rotation
-        body["kind"] = BOX
-        body["size"] = half
-    elif obstacle.kind == "sphere":
-        body["kind"] = BOX
-        body["radius"] = rest[0]
-    elif obstacle.kind == "mesh":
-        body["kind"] = HULL
-        rotation = rest.reshape(3, 3)
-        corners = corners_of(obstacle.mesh)
-        low = corners.min(axis=0)
-        high = corners.max(axis=0)
-        body["position"] = center
-        body["rotation"] = rotation.ravel()
-        # The bounding box of a mesh is that of its corners in the mesh's own frame.
-        return center + rotation @ (low + high) / 2, (high - low) / 2
-    else:
-        length = math.hypot(*rest[:3])
-        rotation = frame_along(rest[:3].tolist(), length)
-        if obstacle.kind == "cylinder":
-            half = np.array([rest[3], rest[3], length])
-            body["kind"] = CYLINDER
-            body["radius"] = 0.0
-        else:
-            half = np.array([0.0, 0.0, length])
-            body["kind"] = BOX
-            body["radius"] = rest[3]
-        body["size"] = half
-    body["position"] = center
-    body["rotation"] = rotation.ravel()
-    return center, half

@@ -11,6 +11,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
+from cnpgen.arrays import Array
 from cnpgen.kernels.symbolic.convex_distances import (
     SMOOTHING_M2,
     UNBOUNDED_EXTENT_M,
@@ -32,9 +33,7 @@ from cnpgen.kernels.symbolic.linalg import (
     transposed_times,
 )
 from cnpgen.kernels.symbolic.symbolic_state import SymbolicState
-from cnpgen.robots.obstacle import Obstacle
 from cnpgen.robots.shape.hull import supporting_planes
-from cnpgen.robots.shape.inline import corners_of
 from cnpgen.robots.solid import number_slices
 
 Size = tuple[float, float, float]
@@ -165,14 +164,16 @@ class SymbolicBox(SymbolicSolid):
 
 @dataclass(frozen=True)
 class SymbolicHull(SymbolicBox):
-    """A convex hull: the intersection of a box and half-spaces in one frame.
+    """A convex hull, the intersection of a box and half-spaces in one frame, with a radius around it.
 
     Attributes:
         planes: Outer unit normals and offsets [m] of the half-spaces, each of shape
             (4,).
+        radius: Radius around the hull [m].
     """
 
     planes: Sequence[Sequence[float]] = ()
+    radius: float = 0.0
 
     def separation(self, first: Vec, second: Vec, freeze: Freeze) -> Scalar:
         """Return the larger one of the distance from the box and the largest separation along a plane's normal."""
@@ -195,7 +196,11 @@ class SymbolicHull(SymbolicBox):
             ]
         *normal, offset = plane  # constant for differentiation
         gap = ca.fmin(dot(normal, a), dot(normal, b)) - offset if self.planes else best
-        return ca.fmax(super().separation(first, second, freeze), gap)
+        return self._rounded(ca.fmax(super().separation(first, second, freeze), gap))
+
+    def _rounded(self, distance: Scalar) -> Scalar:
+        """Return the distance from the hull with its radius."""
+        return distance - self.radius if self.radius else distance
 
     distance = SymbolicSolid.distance
 
@@ -213,7 +218,7 @@ class SymbolicHull(SymbolicBox):
                 for edge, axis in zip(size, axes, strict=True)
             )
             best = ca.fmax(best, dot(normal, position) - reach - offset)
-        return best
+        return self._rounded(best)
 
 
 @dataclass(frozen=True)
@@ -383,51 +388,49 @@ def held_cuboid(state: SymbolicState) -> SymbolicBox:
     return SymbolicBox([0.0] * 3, half, state.kinematics.tip, state.kinematics.rotation)
 
 
+class SolidMakers:
+    """Makers of solids from the values of poses and sizes, which shapes call (``SymbolicBodies``)."""
+
+    def upright(self, bounds: Bounds) -> SymbolicSolid:
+        """Return a box by its bounds along x, y and z [m]."""
+        return SymbolicUprightBox(bounds)
+
+    def box(self, half: Vec, position: Vec, rotation: Vec) -> SymbolicSolid:
+        """Return a box by half its edges [m]; without a rotation its axes are those of the world."""
+        turn = _three_rows(rotation) if rotation else None
+        return SymbolicBox([0.0] * 3, half, position, turn)
+
+    def capsule(self, position: Vec, half: Vec | None, radius: Scalar) -> SymbolicSolid:
+        """Return a capsule by half its axis [m]; a sphere without one."""
+        if half is None:
+            return SymbolicCapsule(position, position, radius)
+        return SymbolicCapsule(subtract(position, half), add(position, half), radius)
+
+    def cylinder(self, position: Vec, half: Vec, radius: Scalar) -> SymbolicSolid:
+        """Return a cylinder by half its axis [m]."""
+        return SymbolicCylinder(position, half, radius)
+
+    def hull(
+        self, corners: Array, radius: float, position: Vec, rotation: Vec
+    ) -> SymbolicSolid:
+        """Return the hull of constant corners with a radius [m]."""
+        low = corners.min(axis=0)
+        high = corners.max(axis=0)
+        center = ((low + high) / 2).tolist()
+        half = ((high - low) / 2).tolist()
+        planes = supporting_planes(corners).tolist()
+        turn = _three_rows(rotation)
+        return SymbolicHull(center, half, position, turn, planes, radius)
+
+
 def symbolic_solids(state: SymbolicState) -> list[SymbolicSolid]:
     """Return the shapes of the obstacles around a robot."""
+    makers = SolidMakers()
     parts = [state.obstacle_poses[part] for part in number_slices(state.obstacles)]
     return [
-        _solid(obstacle, values)
+        obstacle.form.symbolic(values, makers)
         for obstacle, values in zip(state.obstacles, parts, strict=True)
     ]
-
-
-def _solid(obstacle: Obstacle, values: Vec) -> SymbolicSolid:
-    """Return the shape of an obstacle with these values of its pose and size."""
-    if obstacle.upright:
-        return _upright(obstacle, values[0])
-    position = values[:3]
-    rest = values[3:]
-    if obstacle.kind == "box":
-        return SymbolicBox(
-            [0.0] * 3,
-            rest[:3],
-            position,
-            _three_rows(rest[3:]) if obstacle.is_turned else None,
-        )
-    if obstacle.kind == "sphere":
-        return SymbolicCapsule(position, position, rest[0])
-    if obstacle.kind == "capsule":
-        return SymbolicCapsule(
-            subtract(position, rest[:3]), add(position, rest[:3]), rest[3]
-        )
-    if obstacle.kind == "cylinder":
-        return SymbolicCylinder(position, rest[:3], rest[3])
-    corners = corners_of(obstacle.mesh)
-    low = corners.min(axis=0)
-    high = corners.max(axis=0)
-    center = ((low + high) / 2).tolist()
-    half = ((high - low) / 2).tolist()
-    return SymbolicHull(
-        center, half, position, _three_rows(rest), supporting_planes(corners).tolist()
-    )
-
-
-def _upright(obstacle: Obstacle, top: Scalar) -> SymbolicUprightBox:
-    height = obstacle.height
-    ranges = [bounds for bounds in (obstacle.x, obstacle.y) if bounds is not None]
-    sides: Bounds = [(bounds.low, bounds.high) for bounds in ranges]
-    return SymbolicUprightBox([*sides, (None if height is None else top - height, top)])
 
 
 def _three_rows(values: Vec) -> list[Vec]:

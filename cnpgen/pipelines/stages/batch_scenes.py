@@ -9,21 +9,16 @@ from functools import cached_property
 import numpy as np
 
 from cnpgen.arrays import Array, Integers
-from cnpgen.kernels.collision.body_arrays import (
-    BODY,
-    BOX,
-    CYLINDER,
-    Bodies,
-    bounding_boxes,
-)
+from cnpgen.kernels.collision.body_arrays import BODY, Bodies, bounding_boxes
 from cnpgen.pipelines.scene_family import Layout
 from cnpgen.robots.obstacle import Obstacle
+from cnpgen.robots.obstacle_shapes.cylinder import CylinderShape
+from cnpgen.robots.obstacle_shapes.obstacle_shape import BOX, CYLINDER
 from cnpgen.robots.scene import make_scene_table, rotations_of, scene_poses
-from cnpgen.robots.shape.convex_part import PRISM_SIDES
 from cnpgen.store.scene_table import OBSTACLE_KINDS, SceneTable
 
 # Of the radius of a cylinder that contains the prism of judges.
-_PRISM_FACTOR = 1 / np.cos(np.pi / PRISM_SIDES)
+_PRISM_FACTOR = 1 / CylinderShape.radius_share
 
 
 @dataclass(frozen=True, eq=False)

@@ -24,10 +24,11 @@ from cnpgen.pipelines.stages.stage import CandidateBatch, Context, Stage, StageF
 from cnpgen.problems.constraints.clearance import ObjectContact, RobotClearance
 from cnpgen.problems.obstacles import scene_of, table_frame_of
 from cnpgen.problems.problem import Problem
+from cnpgen.robots.obstacle_shapes.solid import Box, Solid
 from cnpgen.robots.robot import Robot
 from cnpgen.robots.shape.hull import coal_hull
 from cnpgen.robots.shape.shape import Shape
-from cnpgen.robots.solid import Box, Solid, height_places, place_obstacles, solids_of
+from cnpgen.robots.solid import height_places, place_obstacles, solids_of
 from cnpgen.schema.keys import field
 from cnpgen.store.field import Field, Fields
 

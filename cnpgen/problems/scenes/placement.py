@@ -200,8 +200,7 @@ def moved_obstacle(obstacle: Obstacle, pose: Pose) -> Obstacle:
         return obstacle
     # p' = p_frame + R_frame p
     x, y, z = (position + rotation @ np.array(obstacle.position)).tolist()
-    if obstacle.kind == "sphere":
-        # A sphere has no rotation.
+    if "rotation" not in obstacle.form.placement:
         return replace(obstacle, position=(x, y, z))
     turn = roll_pitch_yaw(rotation @ turned(*obstacle.rotation))
     return replace(obstacle, position=(x, y, z), rotation=turn)

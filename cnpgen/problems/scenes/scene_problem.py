@@ -19,6 +19,7 @@ from cnpgen.problems.scenes.quaternions import (
 from cnpgen.problems.scenes.scene_request import NO_REQUEST, SceneRequest
 from cnpgen.robots.observation.primitives import KINDS, depths_of_origin, primitives_of
 from cnpgen.robots.obstacle import Obstacle, invalid_obstacle
+from cnpgen.robots.obstacle_shapes.obstacle_shape import shape_class
 from cnpgen.robots.shape.hull import MAX_COORDINATE_M, check_solid, hull_corners
 from cnpgen.robots.shape.inline import address_of, is_inline
 from cnpgen.robots.solid import place_obstacles
@@ -32,13 +33,6 @@ MAX_SCENES = 100_000  # of one call
 MAX_BASE_DEPTH_M = 0.01
 MIN_OBSTACLE_SIZE_M = 1e-6
 MAX_ROTATION_ERROR = 1e-6  # of the products of the rows of a rotation matrix
-# Edge lengths; radius; radius and length.
-_SIZES = {
-    "box": 3,
-    "sphere": 1,
-    "cylinder": 2,
-    "capsule": 2,
-}
 
 
 class SceneError(UsageError):
@@ -147,9 +141,10 @@ def make_obstacle(
     are in the frame of the robot's base.
     """
     where = f"{place}: obstacle {name!r}"
-    if kind not in _SIZES:
+    if kind not in KINDS:
         raise SceneError(f"{where} is a {kind}, expected one of {', '.join(KINDS)}")
-    sizes = _checked_numbers(where, "size", sizes, _SIZES[kind])
+    shape = shape_class(kind)
+    sizes = _checked_numbers(where, "size", sizes, sum(shape.sizes().values()))
     position = _checked_numbers(where, "position", position, 3)
     wxyz = _checked_numbers(where, "quaternion", wxyz, 4)
     if (sizes < MIN_OBSTACLE_SIZE_M).any():
@@ -159,15 +154,10 @@ def make_obstacle(
     if text := quaternion_error(wxyz):
         raise SceneError(f"{where}: {text}")
     x, y, z = position.tolist()
-    placed = Obstacle(name=name, kind=kind, position=(x, y, z))
-    if kind == "sphere":
-        return replace(placed, radius=float(sizes[0]))
-    placed = replace(placed, rotation=roll_pitch_yaw(rotation_matrix(wxyz)))
-    if kind == "box":
-        a, b, c = sizes.tolist()
-        return replace(placed, size=(a, b, c))
-    radius, length = sizes.tolist()
-    return replace(placed, radius=radius, length=length)
+    dimensions = shape.with_sizes(sizes.tolist())
+    if "rotation" in shape.placement:
+        dimensions["rotation"] = roll_pitch_yaw(rotation_matrix(wxyz))
+    return Obstacle(name=name, kind=kind, position=(x, y, z), **dimensions)
 
 
 def _checked_numbers(
@@ -333,6 +323,11 @@ def checked_scene(scene: SceneProblem) -> SceneProblem:
         if obstacle.kind == "mesh" and not is_inline(obstacle.mesh):
             raise SceneError(
                 f"{scene.place}: obstacle {obstacle.name!r} is a mesh file, expected corners: see make_mesh"
+            )
+        if obstacle.shape is not None:
+            raise SceneError(
+                f"{scene.place}: obstacle {obstacle.name!r} has the shape of a package, which problem files alone may have:"
+                " give its hull, see make_mesh"
             )
     counts = len(scene.start_q), len(scene.goal_q), len(scene.obstacles)
     if error := next(scene.request.errors(*counts), ""):

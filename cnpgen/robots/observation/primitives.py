@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
@@ -12,22 +11,20 @@ import numpy as np
 from cnpgen.arrays import AnyArray, Array, Integers
 from cnpgen.errors import UsageError
 from cnpgen.robots.obstacle import Obstacle
-from cnpgen.robots.scene import PARKED_POSITION_M, Scene
-from cnpgen.robots.shape.convex_part import PRISM_SIDES
-from cnpgen.robots.shape.hull import frames_along
-from cnpgen.robots.shape.inline import corners_of, is_inline
-from cnpgen.robots.solid import (
-    UNBOUNDED_OBSTACLE_HEIGHT_M,
-    number_slices,
-    place_obstacles,
-    pose_width,
+from cnpgen.robots.obstacle_shapes.obstacle_shape import (
+    ObstacleShape,
+    SizedShape,
+    shape_class,
 )
-from cnpgen.schema.keys import Range
+from cnpgen.robots.scene import PARKED_POSITION_M, Scene
+from cnpgen.robots.shape.inline import is_inline
+from cnpgen.robots.solid import number_slices, place_obstacles, pose_width
+from cnpgen.store.scene_table import OBSTACLE_KINDS
 
 PLANE_DECIMALS = 9  # to which the planes of triangles of one face agree
 MIN_AREA_M2 = 1e-12  # of a triangle; smaller ones have no normal in single precision
 MAX_KEPT_MESHES = 256
-KINDS = ("box", "sphere", "cylinder", "capsule")  # index: the code of a kind
+KINDS = OBSTACLE_KINDS  # index: the code of a kind
 MESH = len(KINDS)  # the code of the first mesh, followed by those of the others
 NO_BODY = -1  # kind of the padding
 
@@ -54,11 +51,11 @@ class ConvexMesh:
 
 
 @lru_cache(MAX_KEPT_MESHES)
-def convex_mesh(address: str) -> ConvexMesh:
-    """Return the mesh of an obstacle from its corners, a ``data:`` address (``cnpgen.robots.shape.inline``)."""
+def convex_mesh(shape: ObstacleShape) -> ConvexMesh:
+    """Return the mesh of the surface of a shape; round edges have corners in directions 7.5 degrees apart."""
     from scipy.spatial import ConvexHull
 
-    corners = corners_of(address)
+    corners = shape.surface()
     center = (corners.max(axis=0) + corners.min(axis=0)) / 2
     half = np.ptp(corners, axis=0) / 2
     # Relative to the center of the bounding box: sizes and centers are then consistent.
@@ -123,7 +120,7 @@ def primitives_of(obstacles: Sequence[Obstacle], numbers: Array) -> Primitives:
     Poses and sizes (``cnpgen.robots.solid``) have shape (pose_width,), or of N samples
     (N, pose_width), which gives arrays with a first axis of length N.
     """
-    shape = numbers.shape[:-1]
+    samples = numbers.shape[:-1]
     rows = np.atleast_2d(numbers)
     kinds, centers, rotations, sizes = _padding(len(rows), len(obstacles))
     meshes: list[ConvexMesh] = []
@@ -131,14 +128,15 @@ def primitives_of(obstacles: Sequence[Obstacle], numbers: Array) -> Primitives:
         zip(obstacles, number_slices(obstacles), strict=True)
     ):
         of_body = centers[:, index], rotations[:, index], sizes[:, index]
-        if obstacle.kind in KINDS:
+        shape = obstacle.form
+        if isinstance(shape, SizedShape):
             kinds[:, index] = KINDS.index(obstacle.kind)
-            _fill(obstacle, rows[:, part], *of_body)
+            shape.place(rows[:, part], *of_body)
         else:
             kinds[:, index] = MESH + len(meshes)
             meshes.append(_fill_mesh(obstacle, rows[:, part], *of_body))
     arrays = (
-        array.reshape(*shape, *array.shape[1:])
+        array.reshape(*samples, *array.shape[1:])
         for array in (kinds, centers, rotations, sizes)
     )
     return Primitives(*arrays, meshes=tuple(meshes))  # type: ignore[misc,arg-type]
@@ -147,47 +145,16 @@ def primitives_of(obstacles: Sequence[Obstacle], numbers: Array) -> Primitives:
 def _fill_mesh(
     obstacle: Obstacle, numbers: Array, center: Array, rotation: Array, size: Array
 ) -> ConvexMesh:
-    """Fill in the arrays of a mesh as ``_fill`` does, and return the mesh."""
-    if not is_inline(obstacle.mesh):
+    """Fill in the arrays of a mesh as ``SizedShape.place`` does, and return the mesh."""
+    if obstacle.mesh and not is_inline(obstacle.mesh):
         raise UsageError(
             f"obstacle {obstacle.name!r} is a mesh file, expected its corners: see make_mesh"
         )
-    mesh = convex_mesh(obstacle.mesh)
+    mesh = convex_mesh(obstacle.form)
     rotation[:] = numbers[:, 3:].reshape(-1, 3, 3)
     center[:] = numbers[:, :3] + rotation @ mesh.center
     size[:] = mesh.half
     return mesh
-
-
-def _fill(
-    obstacle: Obstacle, numbers: Array, center: Array, rotation: Array, size: Array
-) -> None:
-    """Fill in centers (N, 3), rotations (N, 3, 3), which are units, and sizes (N, 3), which are 0, of an obstacle."""
-    if obstacle.upright:
-        x = obstacle.x or Range(0, 0)
-        y = obstacle.y or Range(0, 0)
-        height = obstacle.height or UNBOUNDED_OBSTACLE_HEIGHT_M
-        center[:, :2] = (x.low + x.high) / 2, (y.low + y.high) / 2
-        center[:, 2] = numbers[:, 0] - height / 2
-        size[:] = (x.high - x.low) / 2, (y.high - y.low) / 2, height / 2
-        return
-    center[:] = numbers[:, :3]
-    rest = numbers[:, 3:]
-    if obstacle.kind == "box":
-        size[:] = rest[:, :3]
-        if obstacle.is_turned:
-            rotation[:] = rest[:, 3:].reshape(-1, 3, 3)
-    elif obstacle.kind == "sphere":
-        size[:, 0] = rest[:, 0]
-    else:
-        half = np.linalg.norm(rest[:, :3], axis=1)
-        rotation[:] = frames_along(rest[:, :3], half)
-        # ``rest[:, 3]`` is the radius of the prism's corners; the cylinder is inside
-        # it.
-        size[:, 0] = rest[:, 3] * (
-            math.cos(math.pi / PRISM_SIDES) if obstacle.kind == "cylinder" else 1.0
-        )
-        size[:, 1] = half
 
 
 def scene_primitives(scenes: Scene | Sequence[Sequence[Obstacle]]) -> Primitives:
@@ -229,6 +196,12 @@ def padded(scenes: Sequence[Primitives]) -> Primitives:
     return Primitives(kinds, centers, rotations, sizes, tuple(meshes))
 
 
+def _sized(kind: str) -> type[SizedShape]:
+    found = shape_class(kind)
+    assert issubclass(found, SizedShape)
+    return found
+
+
 def _padding(*shape: int) -> tuple[Integers, Array, Array, Array]:
     """Return kinds, centers, rotations and sizes of rows of no bodies."""
     centers, sizes = np.zeros((2, *shape, 3))
@@ -249,17 +222,9 @@ def depths_of_origin(bodies: Primitives) -> Array:
     # its absolute value decides.
     origin = -np.einsum("...ji,...j->...i", bodies.rotations, bodies.centers)
     local = np.abs(origin)
-    across = np.hypot(local[..., 0], local[..., 1])
-    up = local[..., 2]
-    radius = bodies.sizes[..., 0]
-    half = bodies.sizes[..., 1]
-    # Box, sphere, cylinder, capsule, in the order of ``KINDS``; then the meshes, in
-    # which the nearest plane of a face counts.
+    # Of meshes the nearest plane of a face counts.
     depths = [
-        (bodies.sizes - local).min(axis=-1),
-        radius - np.linalg.norm(local, axis=-1),
-        np.minimum(radius - across, half - up),
-        radius - np.hypot(across, np.maximum(up - half, 0.0)),
+        *(_sized(kind).depths(local, bodies.sizes) for kind in KINDS),
         *(
             -(origin @ mesh.planes[:, :3].T + mesh.planes[:, 3]).max(axis=-1)
             for mesh in bodies.meshes

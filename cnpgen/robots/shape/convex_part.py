@@ -9,17 +9,11 @@ import numpy as np
 
 from cnpgen.arrays import Array, Integers
 from cnpgen.errors import RecipeError
-from cnpgen.robots.shape.hull import CUBE, MAX_COORDINATE_M, check_solid
+from cnpgen.robots.obstacle_shapes.obstacle_shape import shape_class
+from cnpgen.robots.shape.hull import MAX_COORDINATE_M, check_solid
 from cnpgen.robots.shape.inline import corners_of, is_inline
 from cnpgen.robots.urdf import urdf_tree
-
-# Of the prism that contains a cylinder; its corners exceed the radius by 0.12 %.
-
-PRISM_SIDES = 64
-_ANGLES = np.arange(PRISM_SIDES) * (2 * math.pi / PRISM_SIDES)
-_UNIT_PRISM = np.array(
-    [[math.cos(angle), math.sin(angle), z] for z in (-1.0, 1.0) for angle in _ANGLES]
-)
+from cnpgen.schema import registry
 
 
 @dataclass(frozen=True)
@@ -67,7 +61,7 @@ class Contacts(NamedTuple):
 def link_convex_parts(urdf: str) -> list[ConvexPart]:
     """Read the collision geometry of a URDF whose meshes are inline, in the frames of its links and in its order.
 
-    A cylinder becomes a prism of ``PRISM_SIDES`` sides that contains it; all other
+    A cylinder becomes a prism of 64 sides that contains it; all other
     geometry is exact.
     """
     found = list[ConvexPart]()
@@ -108,29 +102,23 @@ def convex_part_of(link: str, element: ElementTree.Element) -> ConvexPart:
 
 def _core(shape: ElementTree.Element) -> tuple[Array, float]:
     """Return the corners [m] and the thickness [m] of a geometry, in its own frame."""
+    kinds = registry.BUILT_IN[registry.SHAPES]
+    if shape.tag not in kinds:
+        raise ValueError(
+            f"<{shape.tag}> is not a {', '.join(list(kinds)[:-1])} or {[*kinds][-1]}"
+        )
     if shape.tag == "mesh":
         address = shape.get("filename", "")
         if not is_inline(address):
             raise ValueError(f"the mesh {address!r} is not in the text of the URDF")
         return corners_of(address), 0.0
-    if shape.tag == "box":
-        return CUBE * [_positive(each) for each in _numbers(shape, "size", 3)], 0.0
-    if shape.tag not in ("sphere", "cylinder", "capsule"):
-        raise ValueError(
-            f"<{shape.tag}> is not a box, sphere, cylinder, capsule or mesh"
-        )
-    radius = _positive(_numbers(shape, "radius", 1)[0])
-    if shape.tag == "sphere":
-        return np.zeros((1, 3)), radius
-    half = _positive(_numbers(shape, "length", 1)[0]) / 2
-    if shape.tag == "capsule":
-        return np.array([[0.0, 0.0, -half], [0.0, 0.0, half]]), radius
-    return prism(radius / math.cos(math.pi / PRISM_SIDES), half), 0.0
-
-
-def prism(outer: float, half: float) -> Array:
-    """Return the corners of a prism along z by their distance from z and half its length [m], shape (2 sides, 3)."""
-    return _UNIT_PRISM * [outer, outer, half]
+    kind = shape_class(shape.tag)
+    lengths = [
+        _positive(length)
+        for name, count in kind.sizes().items()
+        for length in _numbers(shape, name, count)
+    ]
+    return kind(**kind.with_sizes(lengths)).polytope()
 
 
 def origin_of(element: ElementTree.Element | None) -> tuple[Array, Array]:

@@ -25,14 +25,17 @@ from cnpgen.problems.constraints.table import Table
 from cnpgen.problems.problem import Problem
 from cnpgen.robots.chain import Joint
 from cnpgen.robots.obstacle import Obstacle
+from cnpgen.robots.obstacle_shapes.solid import Box, Solid
 from cnpgen.robots.robot import Robot
-from cnpgen.robots.solid import Box, Solid, solids_of
+from cnpgen.robots.shape.hull import inflated
+from cnpgen.robots.solid import solids_of
 
 SIMULATION_STEP_S = 2.5e-4  # four per tick of the controller
 LINK_RADIUS_M = 0.07  # of the iiwa's links, about half of the clearance of plans
 PUCK_INERTIA = 2.5e-6  # kg m^2; the puck does not turn
 # Shorter links have no shape; the first link collides with nothing.
 MIN_LINK_LENGTH_M = 1e-3
+MAX_ROUND_CORNERS = 2  # of spheres and capsules; other bodies are meshes
 UNBOUNDED_DEPTH_M = 5.0  # depth of obstacles without lower end
 MALLET_POINT_RADIUS_M = 1e-3  # of the sphere at the tip that collides
 SUPPORT_DEPTH_M = 0.05  # half thickness of the body that supports the tip
@@ -241,19 +244,20 @@ def _shape(name: str, obstacle: Obstacle, solid: Solid) -> str:
             else np.array([*solid.low[:2], solid.high[2] - UNBOUNDED_DEPTH_M])
         )
         return f'type="box" pos="{_numbers((low + solid.high) / 2)}" size="{_numbers((solid.high - low) / 2)}"'
-    if obstacle.kind == "sphere":
-        return f'type="sphere" pos="{_numbers(solid.position)}" size="{solid.radius!r}"'
-    if obstacle.kind == "capsule":
-        ends = _numbers(np.ravel(solid.position + solid.corners))
-        return f'type="capsule" fromto="{ends}" size="{solid.radius!r}"'
-    return f'type="mesh" mesh="{name}"'
+    if len(solid.corners) > MAX_ROUND_CORNERS:
+        return f'type="mesh" mesh="{name}"'
+    # One corner with a radius is a sphere, two are a capsule.
+    kind, key = ("sphere", "pos") if len(solid.corners) == 1 else ("capsule", "fromto")
+    ends = _numbers(np.ravel(solid.position + solid.corners))
+    return f'type="{kind}" {key}="{ends}" size="{solid.radius!r}"'
 
 
 def _meshes(scene: SimulatorScene) -> Iterator[str]:
     """Yield the convex hulls of the obstacles that MuJoCo represents by meshes."""
     for name, _, solid in _obstacles(scene):
-        if not isinstance(solid, Box) and not solid.radius:
-            corners = _numbers(np.ravel(solid.position + solid.corners))
+        if not isinstance(solid, Box) and len(solid.corners) > MAX_ROUND_CORNERS:
+            points = inflated(solid.corners, solid.radius)
+            corners = _numbers(np.ravel(solid.position + points))
             yield f'<mesh name="{name}" vertex="{corners}"/>'
 
 

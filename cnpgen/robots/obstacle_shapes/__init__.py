@@ -1,0 +1,1 @@
+"""Shapes of obstacles: a contract, and one file for each shape."""

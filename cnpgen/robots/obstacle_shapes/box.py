@@ -1,0 +1,133 @@
+"""Boxes: upright ones given by ranges, and those with a pose."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
+import numpy as np
+
+from cnpgen.arrays import Array, Vector3
+from cnpgen.robots.obstacle_shapes.obstacle_shape import (
+    BOX,
+    CompiledRecord,
+    SizedShape,
+    SymbolicBodies,
+)
+from cnpgen.robots.obstacle_shapes.solid import Box, Solid, solid_around
+from cnpgen.robots.shape.hull import CUBE
+from cnpgen.schema.keys import Range, field
+
+# Height of the box that represents an obstacle without a lower end.
+UNBOUNDED_OBSTACLE_HEIGHT_M = 10.0
+
+
+@dataclass(frozen=True, kw_only=True)
+class BoxShape(SizedShape):
+    """A box; its numbers are the position, half its edge lengths, and its rotation matrix if it is rotated."""
+
+    size: Vector3 = field("edge lengths", unit="m", low=1e-6)
+
+    def polytope(self) -> tuple[Array, float]:
+        """See ``ObstacleShape``."""
+        return CUBE * self.size, 0.0
+
+    def width(self, *, turned: bool) -> int:
+        """See ``ObstacleShape``."""
+        return 15 if turned else 6
+
+    @classmethod
+    def numbers(cls, position: Array, size: Array, rotation: Array) -> Array:
+        """See ``ObstacleShape``."""
+        return np.concatenate([position, size / 2, rotation.reshape(-1, 9)], axis=1)
+
+    def solid(self, numbers: Array) -> Solid:
+        """See ``ObstacleShape``."""
+        corners = 2 * CUBE * numbers[3:6]
+        turn = numbers[6:].reshape(-1, 3).T
+        return solid_around(numbers[:3], corners @ turn if turn.size else corners)
+
+    def place(
+        self, numbers: Array, center: Array, rotation: Array, size: Array
+    ) -> None:
+        """See ``SizedShape``."""
+        center[:] = numbers[:, :3]
+        size[:] = numbers[:, 3:6]
+        if numbers.shape[1] > 6:
+            rotation[:] = numbers[:, 6:].reshape(-1, 3, 3)
+
+    def record(self, numbers: Array) -> CompiledRecord:
+        """See ``ObstacleShape``."""
+        turn = numbers[6:].reshape(-1, 3) if len(numbers) > 6 else np.eye(3)
+        return CompiledRecord(BOX, numbers[:3], turn, numbers[3:6])
+
+    def symbolic(self, values: Any, bodies: SymbolicBodies) -> Any:
+        """See ``ObstacleShape``."""
+        return bodies.box(values[3:6], values[:3], values[6:])
+
+    @staticmethod
+    def depths(local: Array, size: Array) -> Array:
+        """See ``SizedShape``."""
+        return np.asarray((size - local).min(axis=-1))
+
+    def coal(self) -> Any:
+        """See ``ObstacleShape``."""
+        import coal
+
+        return coal.Box(*self.size)
+
+
+@dataclass(frozen=True, kw_only=True)
+class UprightBox(SizedShape):
+    """A box along the world's axes, given by ranges; its number is the height of its upper face."""
+
+    x: Range  # extents [m]
+    y: Range
+    height: float | None  # without a lower end if None [m]
+
+    height_place: ClassVar[int] = 0
+
+    def _edges(self) -> Array:
+        height = self.height or UNBOUNDED_OBSTACLE_HEIGHT_M
+        return np.array([self.x.high - self.x.low, self.y.high - self.y.low, height])
+
+    def polytope(self) -> tuple[Array, float]:
+        """See ``ObstacleShape``."""
+        return CUBE * self._edges(), 0.0
+
+    def width(self, *, turned: bool) -> int:  # noqa: ARG002
+        """See ``ObstacleShape``."""
+        return 1
+
+    def solid(self, numbers: Array) -> Solid:
+        """See ``ObstacleShape``."""
+        top = float(numbers[0])
+        x, y, height = self.x, self.y, float(self._edges()[2])
+        center = [(x.low + x.high) / 2, (y.low + y.high) / 2, top - height / 2]
+        low = np.array([x.low, y.low, top - height])
+        high = np.array([x.high, y.high, top])
+        return Box(np.array(center), self.polytope()[0], low, high)
+
+    def place(
+        self, numbers: Array, center: Array, rotation: Array, size: Array
+    ) -> None:
+        """See ``SizedShape``."""
+        del rotation  # is a unit
+        center[:, :2] = (self.x.low + self.x.high) / 2, (self.y.low + self.y.high) / 2
+        size[:] = self._edges() / 2
+        center[:, 2] = numbers[:, 0] - size[:, 2]
+
+    def record(self, numbers: Array) -> CompiledRecord:
+        """See ``ObstacleShape``."""
+        solid = self.solid(numbers)
+        center, half = (solid.low + solid.high) / 2, (solid.high - solid.low) / 2
+        return CompiledRecord(BOX, center, np.eye(3), half)
+
+    def symbolic(self, values: Any, bodies: SymbolicBodies) -> Any:
+        """See ``ObstacleShape``."""
+        (top,) = values
+        low = None if self.height is None else top - self.height
+        sides = [(side.low, side.high) for side in (self.x, self.y)]
+        return bodies.upright([*sides, (low, top)])
+
+    depths = BoxShape.depths

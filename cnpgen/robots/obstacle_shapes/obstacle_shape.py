@@ -1,0 +1,184 @@
+"""Contract of shapes of obstacles: a convex polytope with a radius, from which everything else follows.
+
+The numbers of an obstacle, its pose and sizes in samples, kernels and plans, are its
+position [m] and what the shape appends: by default the rows of its rotation matrix.
+A shape whose sizes differ from sample to sample overrides the methods of these numbers.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from dataclasses import dataclass
+from functools import cache
+from typing import Any, ClassVar, NamedTuple, Protocol, get_args
+
+import numpy as np
+
+from cnpgen.arrays import Array
+from cnpgen.robots.obstacle_shapes.solid import Solid, solid_around
+from cnpgen.robots.shape.hull import coal_hull, hull_corners, inflated
+from cnpgen.robots.shape.inline import address_of
+from cnpgen.schema import registry
+from cnpgen.schema.keys import keys
+
+HULL, BOX, CYLINDER = 0, 1, 2  # kinds of bodies in convex.c
+
+
+class CompiledRecord(NamedTuple):
+    """A body of ``convex.c``: a hull of corners, a box or a flat cylinder along z, with a radius around it.
+
+    Attributes:
+        kind: ``HULL``, ``BOX`` or ``CYLINDER``.
+        position: Origin of its frame [m], shape (3,).
+        rotation: Rotation matrix of its frame, shape (3, 3).
+        half: Half the edge lengths of a box, or radius, radius and half the length of a
+            cylinder [m], shape (3,); of a hull those of its bounding box.
+        radius: Radius around it [m].
+        corners: Corners of a hull in its frame [m], shape (V, 3).
+    """
+
+    kind: int
+    position: Array
+    rotation: Array
+    half: Array
+    radius: float = 0.0
+    corners: Array | None = None
+
+
+class SymbolicBodies(Protocol):
+    """Makers of bodies as SX with distances of segments and cuboids (``cnpgen.kernels.symbolic``).
+
+    Shapes name bodies instead of importing them: judges use shapes, and share no code
+    with solvers.
+    """
+
+    def upright(self, bounds: Any) -> Any:
+        """Return a box by its bounds along x, y and z [m]."""
+
+    def box(self, half: Any, position: Any, rotation: Any) -> Any:
+        """Return a box by half its edges [m], and the 9 entries of its rotation, or none of them."""
+
+    def capsule(self, position: Any, half: Any, radius: Any) -> Any:
+        """Return a capsule by the vector from its center to an end of its axis [m]; a sphere with half None."""
+
+    def cylinder(self, position: Any, half: Any, radius: Any) -> Any:
+        """Return a cylinder by the vector from its center to the center of an end [m]."""
+
+    def hull(self, corners: Array, radius: float, position: Any, rotation: Any) -> Any:
+        """Return the hull of constant corners [m], shape (V, 3), with a radius."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class ObstacleShape(ABC):
+    """Shape of an obstacle: a frozen dataclass whose fields are its dimensions, keys of recipes.
+
+    A package's shape defines ``polytope`` and is registered with the entry point group
+    ``cnpgen.shapes``.
+    """
+
+    # Keys of an obstacle beside its position and the dimensions.
+    placement: ClassVar[tuple[str, ...]] = ("rotation",)
+    height_place: ClassVar[int] = 2  # of the number that moves it along z
+
+    @abstractmethod
+    def polytope(self) -> tuple[Array, float]:
+        """Return the corners of a convex hull in the frame of the shape [m], shape (V, 3), and a radius around it [m].
+
+        They contain the shape; the order of the corners must not change.
+        """
+
+    @classmethod
+    def sizes(cls) -> dict[str, int]:
+        """Return the number of lengths of each dimension."""
+        return {key.name: len(get_args(key.hint)) or 1 for key in keys(cls)}
+
+    @classmethod
+    def with_sizes(cls, sizes: list[float]) -> dict[str, Any]:
+        """Return dimensions by name, from their lengths in turn."""
+        rest = iter(sizes)
+        found = {
+            name: tuple(next(rest) for _ in range(count))
+            for name, count in cls.sizes().items()
+        }
+        return {
+            name: value if len(value) > 1 else value[0] for name, value in found.items()
+        }
+
+    def lengths(self) -> list[float]:
+        """Return the lengths of all dimensions in turn [m]."""
+        return [
+            float(value)
+            for name in self.sizes()
+            for value in np.atleast_1d(getattr(self, name))
+        ]
+
+    def width(self, *, turned: bool) -> int:  # noqa: ARG002
+        """Return the count of numbers of an obstacle, which may be rotated."""
+        return 12
+
+    @classmethod
+    def numbers(cls, position: Array, size: Array, rotation: Array) -> Array:  # noqa: ARG003
+        """Return the numbers of M rotated obstacles, shape (M, width).
+
+        Positions and sizes (edge lengths, or radius and length) [m] have shape (M, 3),
+        rotations (M, 3, 3).
+        """
+        return np.concatenate([position, rotation.reshape(-1, 9)], axis=1)
+
+    def solid(self, numbers: Array) -> Solid:
+        """Return the convex body that judges measure, from numbers of shape (width,)."""
+        corners, radius = self.polytope()
+        return solid_around(numbers[:3], corners @ numbers[3:].reshape(3, 3).T, radius)
+
+    def record(self, numbers: Array) -> CompiledRecord:
+        """Return the body that compiled code measures."""
+        corners, radius = self.polytope()
+        half = (corners.max(axis=0) - corners.min(axis=0)) / 2
+        rotation = numbers[3:].reshape(3, 3)
+        return CompiledRecord(HULL, numbers[:3], rotation, half, radius, corners)
+
+    def symbolic(self, values: Any, bodies: SymbolicBodies) -> Any:
+        """Return the body that solvers differentiate, from numbers as SX, a list of length width."""
+        return bodies.hull(*self.polytope(), values[:3], values[3:])
+
+    def surface(self) -> Array:
+        """Return points whose hull is drawn and observed [m], shape (V, 3)."""
+        corners, radius = self.polytope()
+        return hull_corners(inflated(corners, radius)) if radius else corners
+
+    def coal(self) -> Any:
+        """Return its geometry in Coal."""
+        return coal_hull(self.surface())
+
+    def urdf(self) -> tuple[str, dict[str, Any]]:
+        """Return the tag of its geometry in a URDF, and attributes: numbers, or a text."""
+        return "mesh", {"filename": address_of(self.surface())}
+
+
+class SizedShape(ObstacleShape):
+    """A shape whose sizes may differ from sample to sample, known to the compiled observations by a code."""
+
+    @abstractmethod
+    def place(
+        self, numbers: Array, center: Array, rotation: Array, size: Array
+    ) -> None:
+        """Fill in centers (N, 3), rotations (N, 3, 3), which are units, and sizes (N, 3), which are 0 [m].
+
+        Sizes are those of ``Primitives``; numbers have shape (N, width).
+        """
+
+    @staticmethod
+    @abstractmethod
+    def depths(local: Array, size: Array) -> Array:
+        """Return the depths of points in bodies [m], not above 0 outside, from absolute coordinates in their frames."""
+
+    def urdf(self) -> tuple[str, dict[str, Any]]:
+        """See ``ObstacleShape``."""
+        kind = registry.name_of(registry.SHAPES, type(self))
+        return kind, {name: getattr(self, name) for name in self.sizes()}
+
+
+@cache
+def shape_class(kind: str) -> type[ObstacleShape]:
+    """Return the class of a kind of obstacle of the core."""
+    return registry.load(registry.SHAPES, kind)

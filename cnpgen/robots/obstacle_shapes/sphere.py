@@ -1,0 +1,74 @@
+"""Spheres."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
+import numpy as np
+
+from cnpgen.arrays import Array
+from cnpgen.robots.obstacle_shapes.obstacle_shape import (
+    BOX,
+    CompiledRecord,
+    SizedShape,
+    SymbolicBodies,
+)
+from cnpgen.robots.obstacle_shapes.solid import Solid, solid_around
+from cnpgen.schema.keys import field
+
+
+@dataclass(frozen=True, kw_only=True)
+class SphereShape(SizedShape):
+    """A sphere; its numbers are the position and the radius."""
+
+    radius: float = field("radius", unit="m", low=1e-6)
+
+    placement: ClassVar[tuple[str, ...]] = ()
+
+    def polytope(self) -> tuple[Array, float]:
+        """See ``ObstacleShape``."""
+        return np.zeros((1, 3)), self.radius
+
+    def width(self, *, turned: bool) -> int:  # noqa: ARG002
+        """See ``ObstacleShape``."""
+        return 4
+
+    @classmethod
+    def numbers(cls, position: Array, size: Array, rotation: Array) -> Array:  # noqa: ARG003
+        """See ``ObstacleShape``."""
+        return np.concatenate([position, size[:, :1]], axis=1)
+
+    def solid(self, numbers: Array) -> Solid:
+        """See ``ObstacleShape``."""
+        return solid_around(numbers[:3], np.zeros((1, 3)), float(numbers[3]))
+
+    def place(
+        self, numbers: Array, center: Array, rotation: Array, size: Array
+    ) -> None:
+        """See ``SizedShape``."""
+        del rotation  # has no effect
+        center[:] = numbers[:, :3]
+        size[:, 0] = numbers[:, 3]
+
+    def record(self, numbers: Array) -> CompiledRecord:
+        """See ``ObstacleShape``."""
+        # A box of size 0 with a radius.
+        return CompiledRecord(
+            BOX, numbers[:3], np.eye(3), np.zeros(3), float(numbers[3])
+        )
+
+    def symbolic(self, values: Any, bodies: SymbolicBodies) -> Any:
+        """See ``ObstacleShape``."""
+        return bodies.capsule(values[:3], None, values[3])
+
+    @staticmethod
+    def depths(local: Array, size: Array) -> Array:
+        """See ``SizedShape``."""
+        return np.asarray(size[..., 0] - np.linalg.norm(local, axis=-1))
+
+    def coal(self) -> Any:
+        """See ``ObstacleShape``."""
+        import coal
+
+        return coal.Sphere(self.radius)
