@@ -10,6 +10,7 @@ from cnpgen.robots.obstacle import Obstacle
 from cnpgen.robots.shape.hull import hull_corners
 from cnpgen.robots.shape.inline import address_of, corners_of
 from cnpgen.schema.keys import Range
+from tests.examples.capped_cone import coal_cone
 
 KINDS = ("upright", "box", "turned box", "sphere", "cylinder", "capsule", "mesh")
 ROUNDER = 1.3e-3  # of the radius: by how much a cylinder is thinner than the prism that stands for it
@@ -64,6 +65,8 @@ def coal_obstacle(obstacle: Obstacle) -> tuple[Any, Any]:
 
 
 def _shape(obstacle: Obstacle) -> Any:
+    if obstacle.kind == "convex":
+        return coal_cone(obstacle.shape)
     if obstacle.kind == "mesh":
         corners = corners_of(obstacle.mesh)
         points, faces = coal.StdVec_Vec3s(), coal.StdVec_Triangle()

@@ -15,6 +15,7 @@ from cnpgen.problems.constraints.constraint import Constraint
 from cnpgen.problems.objectives import ObjectiveTerm
 from cnpgen.problems.published_rules import PublishedRules
 from cnpgen.problems.scenes.scene_reader import SceneReader
+from cnpgen.robots.obstacle_shapes.obstacle_shape import ObstacleShape
 from cnpgen.schema import addons, registry
 from cnpgen.schema.entry_points import EntryPoint
 from cnpgen.schema.keys import field
