@@ -72,7 +72,7 @@ def with_attached_link(
             xyz = numbers_text(shape.position or ())
             rpy = numbers_text(shape.rotation)
             SubElement(part, "origin", xyz=xyz, rpy=rpy)
-            SubElement(part, "geometry").append(_geometry(shape))
+            SubElement(part, "geometry").append(shape.form.urdf())
     return _with_link(robot, element, link, dict.fromkeys((link, *touch_links)))
 
 
@@ -153,18 +153,6 @@ def uniform_inertia(shapes: Sequence[Obstacle], mass: float) -> pin.Inertia:
         # Inertias add up in one frame: that of the poses.
         total += placement.act(pin.Inertia(density * volume, center, inertia))
     return total
-
-
-def _geometry(shape: Obstacle) -> Element:
-    """Return the geometry of a shape as an element of a URDF."""
-    tag, values = shape.form.urdf()
-    return Element(
-        tag,
-        {
-            key: value if isinstance(value, str) else numbers_text(np.ravel(value))
-            for key, value in values.items()
-        },
-    )
 
 
 def _inertial(inertia: pin.Inertia) -> Element:

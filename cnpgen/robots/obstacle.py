@@ -10,7 +10,11 @@ from cnpgen.arrays import Vector3
 from cnpgen.documents import NamedErrors
 from cnpgen.robots.obstacle_shapes.box import UprightBox
 from cnpgen.robots.obstacle_shapes.mesh import MeshShape
-from cnpgen.robots.obstacle_shapes.obstacle_shape import ObstacleShape, shape_class
+from cnpgen.robots.obstacle_shapes.obstacle_shape import (
+    ObstacleShape,
+    SizedShape,
+    shape_class,
+)
 from cnpgen.robots.parameter_ranges import optional_key
 from cnpgen.robots.shape.hull import CUBE, MAX_COORDINATE_M, check_solid
 from cnpgen.robots.shape.inline import is_inline
@@ -101,13 +105,11 @@ class Obstacle:
         if self.kind not in _KINDS:
             yield "kind", f"must be one of {', '.join(_KINDS)}, got {self.kind!r}"
             return
-        for name in ("x", "y"):
-            if not isinstance(getattr(self, name), Range | None):
-                yield name, f"must be a Range, got {getattr(self, name)!r}"
+        for name, kind in (("x", Range), ("y", Range), ("shape", ObstacleShape)):
+            value = getattr(self, name)
+            if not isinstance(value, kind | None):
+                yield name, f"must be a {kind.__name__}, got {value!r}"
                 return
-        if not isinstance(self.shape, ObstacleShape | None):
-            yield "shape", f"must be an ObstacleShape, got {self.shape!r}"
-            return
         for key in keys(type(self)):
             value = getattr(self, key.name)
             ends = (value.low, value.high) if isinstance(value, Range) else value
@@ -198,12 +200,9 @@ class Obstacle:
         yield from self._mistakes_of_body()
 
     def _mistakes_of_body(self) -> NamedErrors:
-        core = registry.BUILT_IN[registry.SHAPES]
-        if self.shape is not None:
-            name = registry.name_of(registry.SHAPES, type(self.shape))
-            if name in core:
-                yield "shape", f"is a {name}: set kind = {name!r} and its keys instead"
-                return
+        if isinstance(self.shape, SizedShape | MeshShape):
+            yield "shape", "is a kind of the core: set 'kind' and its keys instead"
+            return
         body = MeshShape(mesh=self.mesh) if is_inline(self.mesh) else self.shape
         if body is None:
             return

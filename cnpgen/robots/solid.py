@@ -41,7 +41,7 @@ def height_places(obstacles: Sequence[Obstacle]) -> list[int]:
 
 
 def _count(obstacle: Obstacle) -> int:
-    return obstacle.form.width(turned=obstacle.is_turned)
+    return obstacle.form.widths[obstacle.is_turned]
 
 
 def place_obstacles(

@@ -389,7 +389,7 @@ def held_cuboid(state: SymbolicState) -> SymbolicBox:
 
 
 class SolidMakers:
-    """Makers of solids from the values of poses and sizes, which shapes call (``SymbolicBodies``)."""
+    """Makers of solids from the values of poses and sizes, which shapes call."""
 
     def upright(self, bounds: Bounds) -> SymbolicSolid:
         """Return a box by its bounds along x, y and z [m]."""

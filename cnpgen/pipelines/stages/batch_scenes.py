@@ -9,15 +9,14 @@ from functools import cached_property
 import numpy as np
 
 from cnpgen.arrays import Array, Integers
-from cnpgen.kernels.collision.body_arrays import BODY, Bodies, bounding_boxes
+from cnpgen.kernels.collision.body_arrays import Bodies, primitive_bodies
 from cnpgen.pipelines.scene_family import Layout
+from cnpgen.robots.observation.primitives import KINDS, table_primitives
 from cnpgen.robots.obstacle import Obstacle
 from cnpgen.robots.obstacle_shapes.cylinder import CylinderShape
-from cnpgen.robots.obstacle_shapes.obstacle_shape import BOX, CYLINDER
-from cnpgen.robots.scene import make_scene_table, rotations_of, scene_poses
-from cnpgen.store.scene_table import OBSTACLE_KINDS, SceneTable
+from cnpgen.robots.scene import make_scene_table, scene_poses
+from cnpgen.store.scene_table import SceneTable
 
-# Of the radius of a cylinder that contains the prism of judges.
 _PRISM_FACTOR = 1 / CylinderShape.radius_share
 
 
@@ -49,28 +48,11 @@ class BatchScenes:
     @cached_property
     def bodies(self) -> tuple[Bodies, Array]:
         """Bodies, shape (S, O), and bounding boxes, shape (S, 16, O padded), as of ``obstacle_bodies``."""
-        table = self.table
-        rotation = rotations_of(self.table).reshape(len(self), -1, 9)
-        kind = table.obstacle_kind
-        size = table.obstacle_size.astype(np.float64)
-        box, cylinder = (
-            kind == OBSTACLE_KINDS.index(name) for name in ("box", "cylinder")
-        )
-        half = size / 2
-        # ``OBSTACLE_KINDS`` stores edges of boxes, radii and lengths of the others. In
-        # ``convex.c`` a sphere or capsule is a segment along z with a radius.
-        half[~box] = 0.0
-        half[..., 2] += np.where(box, 0.0, size[..., 1] / 2)
-        half[..., :2] += np.where(cylinder, size[..., 0] * _PRISM_FACTOR, 0.0)[
-            ..., None
-        ]
-        bodies = np.zeros(kind.shape, BODY)
-        bodies["kind"] = np.where(cylinder, CYLINDER, BOX)
-        bodies["size"] = half
-        bodies["radius"] = np.where(box | cylinder, 0.0, size[..., 0])
-        bodies["rotation"] = rotation
-        bodies["position"] = table.obstacle_position
-        return bodies, bounding_boxes(bodies, bodies["position"], half)
+        scenes = table_primitives(self.table)
+        # Of a cylinder that contains the prism of judges.
+        scenes.sizes[scenes.kinds == KINDS.index("cylinder"), 0] *= _PRISM_FACTOR
+        bodies, _, boxes = primitive_bodies(scenes, 0)
+        return bodies, boxes
 
 
 def batch_scenes(

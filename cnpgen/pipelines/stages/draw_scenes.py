@@ -15,8 +15,8 @@ from cnpgen.pipelines.stages.batch_scenes import batch_scenes
 from cnpgen.pipelines.stages.stage import CandidateBatch, Context, Stage, StageFunction
 from cnpgen.problems.constraints.clearance import RobotClearance
 from cnpgen.problems.scenes.scene_problem import MAX_BASE_DEPTH_M
-from cnpgen.robots.observation.primitives import Primitives, depths_of_origin
-from cnpgen.robots.scene import rotations_of, sample_obstacles
+from cnpgen.robots.observation.primitives import depths_of_origin, table_primitives
+from cnpgen.robots.scene import sample_obstacles
 from cnpgen.schema import registry
 from cnpgen.schema.keys import field
 from cnpgen.store.scene_table import OBSTACLE_KINDS, SceneTable
@@ -162,13 +162,4 @@ def _paused_garbage_collection() -> Iterator[None]:
 
 def base_depths(table: SceneTable) -> Array:
     """Return the depth of the robot's base, the origin, in the obstacles of each scene [m], negative outside."""
-    # Of a box half the edge lengths; otherwise the radius and half the length.
-    is_box = table.obstacle_kind[..., None] == OBSTACLE_KINDS.index("box")
-    sizes = table.obstacle_size * np.where(is_box, 0.5, [1.0, 0.5, 0.0])
-    bodies = Primitives(
-        table.obstacle_kind,
-        table.obstacle_position.astype(float),
-        rotations_of(table),
-        sizes,
-    )
-    return np.asarray(depths_of_origin(bodies).max(axis=1))
+    return np.asarray(depths_of_origin(table_primitives(table)).max(axis=1))

@@ -16,10 +16,10 @@ from cnpgen.robots.obstacle_shapes.obstacle_shape import (
     SizedShape,
     shape_class,
 )
-from cnpgen.robots.scene import PARKED_POSITION_M, Scene
+from cnpgen.robots.scene import PARKED_POSITION_M, Scene, rotations_of
 from cnpgen.robots.shape.inline import is_inline
 from cnpgen.robots.solid import number_slices, place_obstacles, pose_width
-from cnpgen.store.scene_table import OBSTACLE_KINDS
+from cnpgen.store.scene_table import OBSTACLE_KINDS, SceneTable
 
 PLANE_DECIMALS = 9  # to which the planes of triangles of one face agree
 MIN_AREA_M2 = 1e-12  # of a triangle; smaller ones have no normal in single precision
@@ -177,6 +177,16 @@ def scene_primitives(scenes: Scene | Sequence[Sequence[Obstacle]]) -> Primitives
         if id(obstacles) not in known:
             known[id(obstacles)] = primitives_of(obstacles, place_obstacles(obstacles))
     return padded([known[id(obstacles)] for obstacles in scenes])
+
+
+def table_primitives(table: SceneTable) -> Primitives:
+    """Return the bodies of the scenes of a table, arrays with a first axis of length S."""
+    kinds = table.obstacle_kind
+    # Of a box half the edge lengths; otherwise the radius and half the length.
+    is_box = kinds[..., None] == KINDS.index("box")
+    sizes = table.obstacle_size * np.where(is_box, 0.5, [1.0, 0.5, 0.0])
+    centers = table.obstacle_position.astype(float)
+    return Primitives(kinds, centers, rotations_of(table), sizes)
 
 
 def padded(scenes: Sequence[Primitives]) -> Primitives:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 
@@ -12,7 +12,6 @@ from cnpgen.robots.obstacle_shapes.obstacle_shape import (
     BOX,
     CompiledRecord,
     SizedShape,
-    SymbolicBodies,
 )
 from cnpgen.robots.obstacle_shapes.solid import Box, Solid, solid_around
 from cnpgen.robots.shape.hull import CUBE
@@ -28,13 +27,11 @@ class BoxShape(SizedShape):
 
     size: Vector3 = field("edge lengths", unit="m", low=1e-6)
 
+    widths = (6, 15)
+
     def polytope(self) -> tuple[Array, float]:
         """See ``ObstacleShape``."""
         return CUBE * self.size, 0.0
-
-    def width(self, *, turned: bool) -> int:
-        """See ``ObstacleShape``."""
-        return 15 if turned else 6
 
     @classmethod
     def numbers(cls, position: Array, size: Array, rotation: Array) -> Array:
@@ -61,9 +58,9 @@ class BoxShape(SizedShape):
         turn = numbers[6:].reshape(-1, 3) if len(numbers) > 6 else np.eye(3)
         return CompiledRecord(BOX, numbers[:3], turn, numbers[3:6])
 
-    def symbolic(self, values: Any, bodies: SymbolicBodies) -> Any:
+    def symbolic(self, values: Any, makers: Any) -> Any:
         """See ``ObstacleShape``."""
-        return bodies.box(values[3:6], values[:3], values[6:])
+        return makers.box(values[3:6], values[:3], values[6:])
 
     @staticmethod
     def depths(local: Array, size: Array) -> Array:
@@ -85,37 +82,36 @@ class UprightBox(SizedShape):
     y: Range
     height: float | None  # without a lower end if None [m]
 
-    height_place: ClassVar[int] = 0
+    height_place = 0
+    widths = (1, 1)
 
+    @property
     def _edges(self) -> Array:
         height = self.height or UNBOUNDED_OBSTACLE_HEIGHT_M
         return np.array([self.x.high - self.x.low, self.y.high - self.y.low, height])
 
+    def _center(self, top: Any) -> Array:
+        x, y, z = (self.x.low + self.x.high) / 2, (self.y.low + self.y.high) / 2, top
+        return np.stack(np.broadcast_arrays(x, y, z - self._edges[2] / 2), axis=-1)
+
     def polytope(self) -> tuple[Array, float]:
         """See ``ObstacleShape``."""
-        return CUBE * self._edges(), 0.0
-
-    def width(self, *, turned: bool) -> int:  # noqa: ARG002
-        """See ``ObstacleShape``."""
-        return 1
+        return CUBE * self._edges, 0.0
 
     def solid(self, numbers: Array) -> Solid:
         """See ``ObstacleShape``."""
-        top = float(numbers[0])
-        x, y, height = self.x, self.y, float(self._edges()[2])
-        center = [(x.low + x.high) / 2, (y.low + y.high) / 2, top - height / 2]
-        low = np.array([x.low, y.low, top - height])
-        high = np.array([x.high, y.high, top])
-        return Box(np.array(center), self.polytope()[0], low, high)
+        (top,) = numbers
+        low = np.array([self.x.low, self.y.low, top - self._edges[2]])
+        high = np.array([self.x.high, self.y.high, top])
+        return Box(self._center(top), self.polytope()[0], low, high)
 
     def place(
         self, numbers: Array, center: Array, rotation: Array, size: Array
     ) -> None:
         """See ``SizedShape``."""
         del rotation  # is a unit
-        center[:, :2] = (self.x.low + self.x.high) / 2, (self.y.low + self.y.high) / 2
-        size[:] = self._edges() / 2
-        center[:, 2] = numbers[:, 0] - size[:, 2]
+        center[:] = self._center(numbers[:, 0])
+        size[:] = self._edges / 2
 
     def record(self, numbers: Array) -> CompiledRecord:
         """See ``ObstacleShape``."""
@@ -123,11 +119,11 @@ class UprightBox(SizedShape):
         center, half = (solid.low + solid.high) / 2, (solid.high - solid.low) / 2
         return CompiledRecord(BOX, center, np.eye(3), half)
 
-    def symbolic(self, values: Any, bodies: SymbolicBodies) -> Any:
+    def symbolic(self, values: Any, makers: Any) -> Any:
         """See ``ObstacleShape``."""
         (top,) = values
         low = None if self.height is None else top - self.height
         sides = [(side.low, side.high) for side in (self.x, self.y)]
-        return bodies.upright([*sides, (low, top)])
+        return makers.upright([*sides, (low, top)])
 
     depths = BoxShape.depths

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from abc import abstractmethod
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
@@ -12,9 +11,9 @@ import numpy as np
 from cnpgen.arrays import Array
 from cnpgen.robots.obstacle_shapes.obstacle_shape import (
     BOX,
+    CYLINDER,
     CompiledRecord,
     SizedShape,
-    SymbolicBodies,
 )
 from cnpgen.robots.obstacle_shapes.solid import Solid, solid_around
 from cnpgen.robots.shape.hull import frame_along, frames_along
@@ -29,10 +28,9 @@ class AxialShape(SizedShape):
     length: float = field("length along the z axis", unit="m", low=1e-6)
 
     radius_share: ClassVar[float] = 1.0  # of the radius among the numbers
+    compiled: ClassVar[int] = BOX
 
-    def width(self, *, turned: bool) -> int:  # noqa: ARG002
-        """See ``ObstacleShape``."""
-        return 7
+    widths = (7, 7)
 
     @classmethod
     def numbers(cls, position: Array, size: Array, rotation: Array) -> Array:
@@ -53,15 +51,13 @@ class AxialShape(SizedShape):
 
     def record(self, numbers: Array) -> CompiledRecord:
         """See ``ObstacleShape``."""
-        half = math.hypot(*numbers[3:6])
-        rotation = frame_along(numbers[3:6].tolist(), half)
-        return self._compiled(numbers[:3], rotation, half, numbers[6])
-
-    @abstractmethod
-    def _compiled(
-        self, position: Array, rotation: Array, half: float, radius: float
-    ) -> CompiledRecord:
-        """Return the body that compiled code measures, from half the length and the radius among the numbers [m]."""
+        length = math.hypot(*numbers[3:6])
+        rotation = frame_along(numbers[3:6].tolist(), length)
+        radius = numbers[6]
+        # A capsule is a box without extent across its axis, with a radius around it.
+        across, around = (radius, 0.0) if self.compiled == CYLINDER else (0.0, radius)
+        half = np.array([across, across, length])
+        return CompiledRecord(self.compiled, numbers[:3], rotation, half, around)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -78,17 +74,9 @@ class CapsuleShape(AxialShape):
         ends = np.array([-numbers[3:6], numbers[3:6]])
         return solid_around(numbers[:3], ends, float(numbers[6]))
 
-    def _compiled(
-        self, position: Array, rotation: Array, half: float, radius: float
-    ) -> CompiledRecord:
-        # A box without extent across the axis, with a radius.
-        return CompiledRecord(
-            BOX, position, rotation, np.array([0.0, 0.0, half]), radius
-        )
-
-    def symbolic(self, values: Any, bodies: SymbolicBodies) -> Any:
+    def symbolic(self, values: Any, makers: Any) -> Any:
         """See ``ObstacleShape``."""
-        return bodies.capsule(values[:3], values[3:6], values[6])
+        return makers.capsule(values[:3], values[3:6], values[6])
 
     @staticmethod
     def depths(local: Array, size: Array) -> Array:

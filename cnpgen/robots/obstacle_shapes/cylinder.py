@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 
@@ -12,8 +12,6 @@ from cnpgen.arrays import Array
 from cnpgen.robots.obstacle_shapes.capsule import AxialShape
 from cnpgen.robots.obstacle_shapes.obstacle_shape import (
     CYLINDER,
-    CompiledRecord,
-    SymbolicBodies,
 )
 from cnpgen.robots.obstacle_shapes.solid import Solid, solid_around
 from cnpgen.robots.shape.hull import frame_along
@@ -30,7 +28,9 @@ _UNIT_PRISM = np.array(
 class CylinderShape(AxialShape):
     """A cylinder; the radius among its numbers is that of the corners of the prism round it."""
 
-    radius_share: ClassVar[float] = math.cos(math.pi / PRISM_SIDES)
+    radius_share = math.cos(math.pi / PRISM_SIDES)
+    # With the radius of the prism's corners it contains the prism.
+    compiled = CYLINDER
 
     def polytope(self) -> tuple[Array, float]:
         """See ``ObstacleShape``."""
@@ -42,17 +42,9 @@ class CylinderShape(AxialShape):
         turn = frame_along(numbers[3:6].tolist(), half)
         return solid_around(numbers[:3], _prism(float(numbers[6]), half) @ turn.T)
 
-    def _compiled(
-        self, position: Array, rotation: Array, half: float, radius: float
-    ) -> CompiledRecord:
-        # The exact cylinder with the radius of the prism's corners contains the prism.
-        return CompiledRecord(
-            CYLINDER, position, rotation, np.array([radius, radius, half])
-        )
-
-    def symbolic(self, values: Any, bodies: SymbolicBodies) -> Any:
+    def symbolic(self, values: Any, makers: Any) -> Any:
         """See ``ObstacleShape``."""
-        return bodies.cylinder(values[:3], values[3:6], values[6])
+        return makers.cylinder(values[:3], values[3:6], values[6])
 
     @staticmethod
     def depths(local: Array, size: Array) -> Array:

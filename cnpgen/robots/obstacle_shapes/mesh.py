@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, ClassVar
 
 from cnpgen.arrays import Array
 from cnpgen.robots.obstacle_shapes.obstacle_shape import ObstacleShape
@@ -17,12 +16,8 @@ class MeshShape(ObstacleShape):
 
     mesh: str = field("corners, in a data: address")
 
-    placement: ClassVar[tuple[str, ...]] = ("rotation", "scale")
+    placement = ("rotation", "scale")
 
     def polytope(self) -> tuple[Array, float]:
         """See ``ObstacleShape``."""
         return corners_of(self.mesh), 0.0
-
-    def urdf(self) -> tuple[str, dict[str, Any]]:
-        """See ``ObstacleShape``."""
-        return "mesh", {"filename": self.mesh}

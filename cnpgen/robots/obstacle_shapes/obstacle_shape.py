@@ -10,7 +10,8 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from functools import cache
-from typing import Any, ClassVar, NamedTuple, Protocol, get_args
+from typing import Any, ClassVar, NamedTuple, get_args
+from xml.etree.ElementTree import Element
 
 import numpy as np
 
@@ -18,6 +19,7 @@ from cnpgen.arrays import Array
 from cnpgen.robots.obstacle_shapes.solid import Solid, solid_around
 from cnpgen.robots.shape.hull import coal_hull, hull_corners, inflated
 from cnpgen.robots.shape.inline import address_of
+from cnpgen.robots.urdf import numbers_text
 from cnpgen.schema import registry
 from cnpgen.schema.keys import keys
 
@@ -45,29 +47,6 @@ class CompiledRecord(NamedTuple):
     corners: Array | None = None
 
 
-class SymbolicBodies(Protocol):
-    """Makers of bodies as SX with distances of segments and cuboids (``cnpgen.kernels.symbolic``).
-
-    Shapes name bodies instead of importing them: judges use shapes, and share no code
-    with solvers.
-    """
-
-    def upright(self, bounds: Any) -> Any:
-        """Return a box by its bounds along x, y and z [m]."""
-
-    def box(self, half: Any, position: Any, rotation: Any) -> Any:
-        """Return a box by half its edges [m], and the 9 entries of its rotation, or none of them."""
-
-    def capsule(self, position: Any, half: Any, radius: Any) -> Any:
-        """Return a capsule by the vector from its center to an end of its axis [m]; a sphere with half None."""
-
-    def cylinder(self, position: Any, half: Any, radius: Any) -> Any:
-        """Return a cylinder by the vector from its center to the center of an end [m]."""
-
-    def hull(self, corners: Array, radius: float, position: Any, rotation: Any) -> Any:
-        """Return the hull of constant corners [m], shape (V, 3), with a radius."""
-
-
 @dataclass(frozen=True, kw_only=True)
 class ObstacleShape(ABC):
     """Shape of an obstacle: a frozen dataclass whose fields are its dimensions, keys of recipes.
@@ -79,6 +58,8 @@ class ObstacleShape(ABC):
     # Keys of an obstacle beside its position and the dimensions.
     placement: ClassVar[tuple[str, ...]] = ("rotation",)
     height_place: ClassVar[int] = 2  # of the number that moves it along z
+    # Count of numbers of an obstacle, without and with a rotation.
+    widths: ClassVar[tuple[int, int]] = (12, 12)
 
     @abstractmethod
     def polytope(self) -> tuple[Array, float]:
@@ -94,27 +75,11 @@ class ObstacleShape(ABC):
 
     @classmethod
     def with_sizes(cls, sizes: list[float]) -> dict[str, Any]:
-        """Return dimensions by name, from their lengths in turn."""
-        rest = iter(sizes)
-        found = {
-            name: tuple(next(rest) for _ in range(count))
-            for name, count in cls.sizes().items()
-        }
-        return {
-            name: value if len(value) > 1 else value[0] for name, value in found.items()
-        }
-
-    def lengths(self) -> list[float]:
-        """Return the lengths of all dimensions in turn [m]."""
-        return [
-            float(value)
-            for name in self.sizes()
-            for value in np.atleast_1d(getattr(self, name))
-        ]
-
-    def width(self, *, turned: bool) -> int:  # noqa: ARG002
-        """Return the count of numbers of an obstacle, which may be rotated."""
-        return 12
+        """Return dimensions by name from lengths: three of one dimension, or one of each."""
+        counts = cls.sizes()
+        if 3 in counts.values():
+            return dict.fromkeys(counts, tuple(sizes))
+        return dict(zip(counts, sizes, strict=False))
 
     @classmethod
     def numbers(cls, position: Array, size: Array, rotation: Array) -> Array:  # noqa: ARG003
@@ -137,9 +102,13 @@ class ObstacleShape(ABC):
         rotation = numbers[3:].reshape(3, 3)
         return CompiledRecord(HULL, numbers[:3], rotation, half, radius, corners)
 
-    def symbolic(self, values: Any, bodies: SymbolicBodies) -> Any:
-        """Return the body that solvers differentiate, from numbers as SX, a list of length width."""
-        return bodies.hull(*self.polytope(), values[:3], values[3:])
+    def symbolic(self, values: Any, makers: Any) -> Any:
+        """Return the body that solvers differentiate, from numbers as SX, a list of length width.
+
+        ``makers`` are ``SolidMakers`` of ``cnpgen.kernels``. Shapes do not import them:
+        judges use shapes, and share no code with solvers.
+        """
+        return makers.hull(*self.polytope(), values[:3], values[3:])
 
     def surface(self) -> Array:
         """Return points whose hull is drawn and observed [m], shape (V, 3)."""
@@ -150,9 +119,9 @@ class ObstacleShape(ABC):
         """Return its geometry in Coal."""
         return coal_hull(self.surface())
 
-    def urdf(self) -> tuple[str, dict[str, Any]]:
-        """Return the tag of its geometry in a URDF, and attributes: numbers, or a text."""
-        return "mesh", {"filename": address_of(self.surface())}
+    def urdf(self) -> Element:
+        """Return its geometry as an element of a URDF."""
+        return Element("mesh", filename=address_of(self.surface()))
 
 
 class SizedShape(ObstacleShape):
@@ -172,10 +141,12 @@ class SizedShape(ObstacleShape):
     def depths(local: Array, size: Array) -> Array:
         """Return the depths of points in bodies [m], not above 0 outside, from absolute coordinates in their frames."""
 
-    def urdf(self) -> tuple[str, dict[str, Any]]:
+    def urdf(self) -> Element:
         """See ``ObstacleShape``."""
-        kind = registry.name_of(registry.SHAPES, type(self))
-        return kind, {name: getattr(self, name) for name in self.sizes()}
+        lengths = {
+            name: numbers_text(np.ravel(getattr(self, name))) for name in self.sizes()
+        }
+        return Element(registry.name_of(registry.SHAPES, type(self)), lengths)
 
 
 @cache

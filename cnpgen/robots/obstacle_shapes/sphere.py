@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 
@@ -12,7 +12,6 @@ from cnpgen.robots.obstacle_shapes.obstacle_shape import (
     BOX,
     CompiledRecord,
     SizedShape,
-    SymbolicBodies,
 )
 from cnpgen.robots.obstacle_shapes.solid import Solid, solid_around
 from cnpgen.schema.keys import field
@@ -24,15 +23,12 @@ class SphereShape(SizedShape):
 
     radius: float = field("radius", unit="m", low=1e-6)
 
-    placement: ClassVar[tuple[str, ...]] = ()
+    placement = ()
+    widths = (4, 4)
 
     def polytope(self) -> tuple[Array, float]:
         """See ``ObstacleShape``."""
         return np.zeros((1, 3)), self.radius
-
-    def width(self, *, turned: bool) -> int:  # noqa: ARG002
-        """See ``ObstacleShape``."""
-        return 4
 
     @classmethod
     def numbers(cls, position: Array, size: Array, rotation: Array) -> Array:  # noqa: ARG003
@@ -58,9 +54,9 @@ class SphereShape(SizedShape):
             BOX, numbers[:3], np.eye(3), np.zeros(3), float(numbers[3])
         )
 
-    def symbolic(self, values: Any, bodies: SymbolicBodies) -> Any:
+    def symbolic(self, values: Any, makers: Any) -> Any:
         """See ``ObstacleShape``."""
-        return bodies.capsule(values[:3], None, values[3])
+        return makers.capsule(values[:3], None, values[3])
 
     @staticmethod
     def depths(local: Array, size: Array) -> Array:

@@ -41,7 +41,7 @@ INVALID = {
 
 SIZE = (0.1, 0.1, 0.1)
 INVALID |= {
-    "kind must be one of box, sphere, cylinder, capsule, mesh, got 'cone'": Obstacle(
+    "kind must be one of box, sphere, cylinder, capsule, mesh, convex, got 'cone'": Obstacle(
         **PLACE, kind="cone"
     ),
     "is a box and needs 'position' and 'size'": Obstacle(**PLACE),
