@@ -34,7 +34,7 @@ from cnpgen.refine.proof.explain import Feasibility as Feasibility
 from cnpgen.refine.refinement import Refinement as Refinement
 from cnpgen.refine.task import Attempt as Attempt
 from cnpgen.refine.task import Outcome as Outcome
-from cnpgen.robots.solid import Solid as Solid
+from cnpgen.robots.obstacle_shapes.convex_solid import Solid as Solid
 from cnpgen.store.check import Finding as Finding
 from cnpgen.store.dataset_spec import DatasetSpec as DatasetSpec
 from cnpgen.store.dataset_spec import ShardTask as ShardTask

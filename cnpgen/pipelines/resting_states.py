@@ -12,7 +12,7 @@ from cnpgen.problems.constraints.clearance import RobotClearance
 from cnpgen.problems.constraints.link_clearance import SelfClearance
 from cnpgen.problems.problem import Problem
 from cnpgen.robots.obstacle import Obstacle
-from cnpgen.robots.obstacle_shapes.solid import Solid
+from cnpgen.robots.obstacle_shapes.convex_solid import Solid
 from cnpgen.robots.robot import Robot
 from cnpgen.robots.solid import place_obstacles, solids_of
 from cnpgen.world.forward_kinematics import ForwardKinematics

@@ -8,8 +8,8 @@ import numpy as np
 
 from cnpgen.arrays import Vector3
 from cnpgen.documents import NamedErrors
-from cnpgen.robots.obstacle_shapes.box import UprightBox
-from cnpgen.robots.obstacle_shapes.mesh import MeshShape
+from cnpgen.robots.obstacle_shapes.box_shape import UprightBox
+from cnpgen.robots.obstacle_shapes.mesh_shape import MeshShape
 from cnpgen.robots.obstacle_shapes.obstacle_shape import (
     ObstacleShape,
     SizedShape,

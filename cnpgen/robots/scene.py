@@ -14,8 +14,8 @@ import numpy as np
 from cnpgen.arrays import AnyArray, Array
 from cnpgen.errors import UsageError, counted
 from cnpgen.robots.obstacle import Obstacle
+from cnpgen.robots.obstacle_shapes.convex_solid import Solid
 from cnpgen.robots.obstacle_shapes.obstacle_shape import shape_class
-from cnpgen.robots.obstacle_shapes.solid import Solid
 from cnpgen.robots.shape.hull import MAX_COORDINATE_M
 from cnpgen.robots.solid import (
     number_slices,

@@ -14,7 +14,7 @@ import numpy as np
 
 from cnpgen.arrays import Array
 from cnpgen.robots.obstacle import Obstacle
-from cnpgen.robots.obstacle_shapes.solid import Solid
+from cnpgen.robots.obstacle_shapes.convex_solid import Solid
 from cnpgen.robots.shape.convex_part import turned
 
 _NOTHING = (0.0, 0.0, 0.0)

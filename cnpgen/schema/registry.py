@@ -103,11 +103,11 @@ BUILT_IN: dict[str, dict[str, str]] = {
         "tip-reference": "cnpgen.problems.objectives:TipReference",
     },
     SHAPES: {
-        "box": "cnpgen.robots.obstacle_shapes.box:BoxShape",
-        "sphere": "cnpgen.robots.obstacle_shapes.sphere:SphereShape",
-        "cylinder": "cnpgen.robots.obstacle_shapes.cylinder:CylinderShape",
-        "capsule": "cnpgen.robots.obstacle_shapes.capsule:CapsuleShape",
-        "mesh": "cnpgen.robots.obstacle_shapes.mesh:MeshShape",
+        "box": "cnpgen.robots.obstacle_shapes.box_shape:BoxShape",
+        "sphere": "cnpgen.robots.obstacle_shapes.sphere_shape:SphereShape",
+        "cylinder": "cnpgen.robots.obstacle_shapes.cylinder_shape:CylinderShape",
+        "capsule": "cnpgen.robots.obstacle_shapes.capsule_shape:CapsuleShape",
+        "mesh": "cnpgen.robots.obstacle_shapes.mesh_shape:MeshShape",
     },
     EXPORTERS: {
         "npz": "cnpgen.plans.formats:NumpyArchive",

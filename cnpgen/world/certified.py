@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from cnpgen.arrays import Array
-from cnpgen.robots.obstacle_shapes.solid import Solid
+from cnpgen.robots.obstacle_shapes.convex_solid import Solid
 from cnpgen.robots.shape.hull import coal_hull
 
 # Rotation matrix of shape (3, 3), and origin [m], shape (3,).

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from cnpgen.arrays import Array
-from cnpgen.robots.obstacle_shapes.solid import Box, Solid, same_shape
+from cnpgen.robots.obstacle_shapes.convex_solid import Box, Solid, same_shape
 from cnpgen.robots.shape.hull import CUBE, frame_along
 from cnpgen.world.certified import CertifiedDistance, ConvexBody, Pose, convex_body
 

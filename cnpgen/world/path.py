@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cnpgen.arrays import Array
-from cnpgen.robots.obstacle_shapes.solid import Solid
+from cnpgen.robots.obstacle_shapes.convex_solid import Solid
 from cnpgen.robots.shape.hull import CUBE
 from cnpgen.robots.solid import place_obstacles
 from cnpgen.world.certified import PlacedBody, convex_body, placed_solid

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cnpgen.arrays import Array
-from cnpgen.robots.obstacle_shapes.solid import Solid, same_shape
+from cnpgen.robots.obstacle_shapes.convex_solid import Solid, same_shape
 from cnpgen.robots.shape.hull import ball_round
 from cnpgen.robots.shape.shape import Shape
 from cnpgen.world.certified import CertifiedDistance, PlacedBody, convex_body

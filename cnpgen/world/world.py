@@ -12,7 +12,7 @@ import numpy as np
 from cnpgen.arrays import Array
 from cnpgen.errors import RecipeError
 from cnpgen.robots.obstacle import Obstacle
-from cnpgen.robots.obstacle_shapes.solid import Solid
+from cnpgen.robots.obstacle_shapes.convex_solid import Solid
 from cnpgen.robots.robot import Robot
 from cnpgen.robots.solid import place_obstacles, pose_width, solids_of
 from cnpgen.world.collision_world import CollisionWorld

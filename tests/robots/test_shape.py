@@ -13,7 +13,7 @@ import scipy
 from cnpgen.errors import RecipeError
 from cnpgen.problems.load_robot import load_robot
 from cnpgen.problems.problem_file import load_problem
-from cnpgen.robots.obstacle_shapes.cylinder import PRISM_SIDES
+from cnpgen.robots.obstacle_shapes.cylinder_shape import PRISM_SIDES
 from cnpgen.robots.robot import Attached, reduced_model
 from cnpgen.robots.shape import link_pairs as pairs
 from cnpgen.robots.shape import shape as module

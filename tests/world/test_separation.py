@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 import scipy
 
-from cnpgen.robots.obstacle_shapes.solid import Box
+from cnpgen.robots.obstacle_shapes.convex_solid import Box
 from cnpgen.robots.shape.hull import coal_hull
 from cnpgen.world import certified
 from cnpgen.world.path import cuboid_gaps, cuboid_separation, gaps, separation

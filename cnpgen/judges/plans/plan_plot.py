@@ -14,7 +14,7 @@ from cnpgen.problems.constraints.joint import MotorTorques, motor_conditions
 from cnpgen.problems.constraints.table import Table
 from cnpgen.problems.obstacles import scene_of
 from cnpgen.problems.problem import Problem
-from cnpgen.robots.obstacle_shapes.solid import Solid
+from cnpgen.robots.obstacle_shapes.convex_solid import Solid
 from cnpgen.robots.robot import Robot
 from cnpgen.robots.scene import Scene
 from cnpgen.robots.solid import place_obstacles

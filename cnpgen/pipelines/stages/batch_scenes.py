@@ -13,7 +13,7 @@ from cnpgen.kernels.collision.body_arrays import Bodies, primitive_bodies
 from cnpgen.pipelines.scene_family import Layout
 from cnpgen.robots.observation.primitives import KINDS, table_primitives
 from cnpgen.robots.obstacle import Obstacle
-from cnpgen.robots.obstacle_shapes.cylinder import CylinderShape
+from cnpgen.robots.obstacle_shapes.cylinder_shape import CylinderShape
 from cnpgen.robots.scene import make_scene_table, scene_poses
 from cnpgen.store.scene_table import SceneTable
 

@@ -24,7 +24,7 @@ from cnpgen.pipelines.stages.stage import CandidateBatch, Context, Stage, StageF
 from cnpgen.problems.constraints.clearance import ObjectContact, RobotClearance
 from cnpgen.problems.obstacles import scene_of, table_frame_of
 from cnpgen.problems.problem import Problem
-from cnpgen.robots.obstacle_shapes.solid import Box, Solid
+from cnpgen.robots.obstacle_shapes.convex_solid import Box, Solid
 from cnpgen.robots.robot import Robot
 from cnpgen.robots.shape.hull import coal_hull
 from cnpgen.robots.shape.shape import Shape

@@ -16,7 +16,7 @@ from xml.etree.ElementTree import Element
 import numpy as np
 
 from cnpgen.arrays import Array
-from cnpgen.robots.obstacle_shapes.solid import Solid, solid_around
+from cnpgen.robots.obstacle_shapes.convex_solid import Solid, solid_around
 from cnpgen.robots.shape.hull import coal_hull, hull_corners, inflated
 from cnpgen.robots.shape.inline import address_of
 from cnpgen.robots.urdf import numbers_text

@@ -25,7 +25,7 @@ from cnpgen.problems.constraints.table import Table
 from cnpgen.problems.problem import Problem
 from cnpgen.robots.chain import Joint
 from cnpgen.robots.obstacle import Obstacle
-from cnpgen.robots.obstacle_shapes.solid import Box, Solid
+from cnpgen.robots.obstacle_shapes.convex_solid import Box, Solid
 from cnpgen.robots.robot import Robot
 from cnpgen.robots.shape.hull import inflated
 from cnpgen.robots.solid import solids_of

@@ -9,11 +9,11 @@ from typing import Any
 import numpy as np
 
 from cnpgen.arrays import Array
-from cnpgen.robots.obstacle_shapes.capsule import AxialShape
+from cnpgen.robots.obstacle_shapes.capsule_shape import AxialShape
+from cnpgen.robots.obstacle_shapes.convex_solid import Solid, solid_around
 from cnpgen.robots.obstacle_shapes.obstacle_shape import (
     CYLINDER,
 )
-from cnpgen.robots.obstacle_shapes.solid import Solid, solid_around
 from cnpgen.robots.shape.hull import frame_along
 
 # Of the prism that contains a cylinder; its corners exceed the radius by 0.12 %.

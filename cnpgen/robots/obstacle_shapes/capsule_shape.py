@@ -9,13 +9,13 @@ from typing import Any, ClassVar
 import numpy as np
 
 from cnpgen.arrays import Array
+from cnpgen.robots.obstacle_shapes.convex_solid import Solid, solid_around
 from cnpgen.robots.obstacle_shapes.obstacle_shape import (
     BOX,
     CYLINDER,
     CompiledRecord,
     SizedShape,
 )
-from cnpgen.robots.obstacle_shapes.solid import Solid, solid_around
 from cnpgen.robots.shape.hull import frame_along, frames_along
 from cnpgen.schema.keys import field
 

@@ -8,12 +8,12 @@ from typing import Any
 import numpy as np
 
 from cnpgen.arrays import Array
+from cnpgen.robots.obstacle_shapes.convex_solid import Solid, solid_around
 from cnpgen.robots.obstacle_shapes.obstacle_shape import (
     BOX,
     CompiledRecord,
     SizedShape,
 )
-from cnpgen.robots.obstacle_shapes.solid import Solid, solid_around
 from cnpgen.schema.keys import field
 
 

@@ -8,12 +8,12 @@ from typing import Any
 import numpy as np
 
 from cnpgen.arrays import Array, Vector3
+from cnpgen.robots.obstacle_shapes.convex_solid import Box, Solid, solid_around
 from cnpgen.robots.obstacle_shapes.obstacle_shape import (
     BOX,
     CompiledRecord,
     SizedShape,
 )
-from cnpgen.robots.obstacle_shapes.solid import Box, Solid, solid_around
 from cnpgen.robots.shape.hull import CUBE
 from cnpgen.schema.keys import Range, field
 
