@@ -20,7 +20,7 @@ from cnpgen.addons.view.view_bodies import wrapped
 from cnpgen.cli.main import main
 from cnpgen.errors import PluginError, RecipeError, UsageError
 from cnpgen.kernels.symbolic.linalg import symbols
-from cnpgen.kernels.symbolic.obstacle_distances import SolidMakers
+from cnpgen.kernels.symbolic.obstacle_distances import SOLIDS
 from cnpgen.problems.load_robot import load_robot
 from cnpgen.problems.problem import Problem, resolved
 from cnpgen.problems.problem_file import load_problem, restore_problem
@@ -86,7 +86,7 @@ def test_solvers_have_a_lower_bound_with_the_sign_of_the_distance(
 ) -> None:
     (obstacle,) = problem.obstacle
     (ends_sx, ends), (numbers_sx, numbers) = symbols("ends", 6), symbols("numbers", 12)
-    solid = obstacle.form.symbolic(numbers, SolidMakers())
+    solid = obstacle.form.symbolic(numbers, SOLIDS)
     distance = solid.separation(ends[:3], ends[3:], lambda value: value)
     function = ca.Function("cone", [ends_sx, numbers_sx], [distance])
     where, poses = segments(200), place_obstacles([obstacle])

@@ -7,13 +7,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cnpgen.arrays import Array
-from cnpgen.robots.observation.primitives import KINDS, MESH, Primitives
+from cnpgen.robots.observation.primitives import KINDS, MESH, Primitives, primitives_of
 from cnpgen.robots.obstacle import Obstacle
-from cnpgen.robots.obstacle_shapes.obstacle_shape import BOX, CYLINDER, HULL
-from cnpgen.robots.solid import number_slices
 
 Bodies = NDArray[np.void]
 
+HULL, BOX, CYLINDER = 0, 1, 2  # kinds in convex.c
 LANES = 8  # vertices and obstacles are padded to a multiple of the widest vector
 BLOCK = 16  # vertices, as in convex.c
 # Fewer vertices are found as fast without blocks; convex.c has memory for 1024 blocks.
@@ -120,7 +119,7 @@ def primitive_bodies(obstacles: Primitives, first: int) -> tuple[Bodies, Array, 
     """Return the obstacles of N samples as bodies, vertices of meshes and boxes, as ``obstacle_bodies`` of one."""
     kinds = obstacles.kinds
     sizes = obstacles.sizes
-    hulls = [hull_vertices(mesh.corners) for mesh in obstacles.meshes]
+    hulls = [hull_vertices(mesh.core) for mesh in obstacles.meshes]
     ends = np.cumsum([first, *(len(hull.values) for hull in hulls)])
     box = kinds == _BOX
     cylinder = kinds == _CYLINDER
@@ -134,13 +133,17 @@ def primitive_bodies(obstacles: Primitives, first: int) -> tuple[Bodies, Array, 
     centers = np.where((kinds >= 0)[..., None], obstacles.centers, PADDING_DISTANCE_M)
     bodies["position"] = centers
     bodies["rotation"] = obstacles.rotations.reshape(*kinds.shape, 9)
-    for index, hull in enumerate(hulls):
-        hull.put(bodies, kinds == MESH + index, int(ends[index]))
+    for index, (hull, shape) in enumerate(zip(hulls, obstacles.meshes, strict=True)):
+        here = kinds == MESH + index
+        hull.put(bodies, here, int(ends[index]))
+        bodies["radius"][here] = shape.radius
     bodies["size"][box] = sizes[box]
     bodies["size"][cylinder] = sizes[cylinder][:, [0, 0, 1]]
     bodies["size"][rounded, 2] = sizes[rounded, 1]
     bodies["radius"][rounded] = sizes[rounded, 0]
-    half = np.where(mesh[..., None], sizes, bodies["size"])
+    # Of a mesh without its radius.
+    inner = sizes - bodies["radius"][..., None]
+    half = np.where(mesh[..., None], inner, bodies["size"])
     return (
         bodies,
         np.concatenate([*(hull.values for hull in hulls), np.empty(0)]),
@@ -163,28 +166,6 @@ def obstacle_bodies(
         bounding boxes by rows (center, half sizes, rotation, radius), shape (16, O
         padded).
     """
-    bodies = np.zeros(len(obstacles), BODY)
-    vertices = list[Array]()
-    centers, halves = np.empty((2, len(obstacles), 3))
-    for index, (obstacle, part) in enumerate(
-        zip(obstacles, number_slices(obstacles), strict=True)
-    ):
-        record = obstacle.form.record(numbers[part])
-        centers[index], halves[index] = record.position, record.half
-        body = bodies[index]
-        body["kind"] = record.kind
-        body["position"] = record.position
-        body["rotation"] = record.rotation.ravel()
-        body["radius"] = record.radius
-        if record.corners is None:
-            body["size"] = record.half
-            continue
-        # The bounding box of a hull is that of its corners in its own frame.
-        ends = record.corners.min(axis=0) + record.corners.max(axis=0)
-        centers[index] += record.rotation @ ends / 2
-        hull = hull_vertices(record.corners)
-        hull.put(bodies, index, first)
-        vertices.append(hull.values)
-        first += len(hull.values)
-    (boxes,) = bounding_boxes(bodies[None], centers[None], halves[None])
-    return bodies, np.concatenate([*vertices, np.empty(0)]), boxes
+    found = primitives_of(obstacles, numbers[None], with_prisms=True)
+    (bodies,), vertices, (boxes,) = primitive_bodies(found, first)
+    return bodies, vertices, boxes

@@ -9,6 +9,7 @@ point: the deepest in a cylinder, the midpoint of the overlap in a box with a po
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from types import SimpleNamespace
 from typing import NamedTuple
 
 from cnpgen.arrays import Array
@@ -388,47 +389,43 @@ def held_cuboid(state: SymbolicState) -> SymbolicBox:
     return SymbolicBox([0.0] * 3, half, state.kinematics.tip, state.kinematics.rotation)
 
 
-class SolidMakers:
-    """Makers of solids from the values of poses and sizes, which shapes call."""
+def _box(half: Vec, position: Vec, rotation: Vec) -> SymbolicBox:
+    """Return a box by half its edges [m]; without a rotation its axes are those of the world."""
+    turn = _three_rows(rotation) if rotation else None
+    return SymbolicBox([0.0] * 3, half, position, turn)
 
-    def upright(self, bounds: Bounds) -> SymbolicSolid:
-        """Return a box by its bounds along x, y and z [m]."""
-        return SymbolicUprightBox(bounds)
 
-    def box(self, half: Vec, position: Vec, rotation: Vec) -> SymbolicSolid:
-        """Return a box by half its edges [m]; without a rotation its axes are those of the world."""
-        turn = _three_rows(rotation) if rotation else None
-        return SymbolicBox([0.0] * 3, half, position, turn)
+def _capsule(position: Vec, half: Vec, radius: Scalar) -> SymbolicCapsule:
+    """Return a capsule by half its axis [m]."""
+    return SymbolicCapsule(subtract(position, half), add(position, half), radius)
 
-    def capsule(self, position: Vec, half: Vec | None, radius: Scalar) -> SymbolicSolid:
-        """Return a capsule by half its axis [m]; a sphere without one."""
-        if half is None:
-            return SymbolicCapsule(position, position, radius)
-        return SymbolicCapsule(subtract(position, half), add(position, half), radius)
 
-    def cylinder(self, position: Vec, half: Vec, radius: Scalar) -> SymbolicSolid:
-        """Return a cylinder by half its axis [m]."""
-        return SymbolicCylinder(position, half, radius)
+def _hull(corners: Array, radius: float, position: Vec, rotation: Vec) -> SymbolicHull:
+    """Return the hull of constant corners with a radius [m]."""
+    low = corners.min(axis=0)
+    high = corners.max(axis=0)
+    center = ((low + high) / 2).tolist()
+    half = ((high - low) / 2).tolist()
+    planes = supporting_planes(corners).tolist()
+    return SymbolicHull(center, half, position, _three_rows(rotation), planes, radius)
 
-    def hull(
-        self, corners: Array, radius: float, position: Vec, rotation: Vec
-    ) -> SymbolicSolid:
-        """Return the hull of constant corners with a radius [m]."""
-        low = corners.min(axis=0)
-        high = corners.max(axis=0)
-        center = ((low + high) / 2).tolist()
-        half = ((high - low) / 2).tolist()
-        planes = supporting_planes(corners).tolist()
-        turn = _three_rows(rotation)
-        return SymbolicHull(center, half, position, turn, planes, radius)
+
+# Makers of solids from the values of poses and sizes, which shapes call.
+SOLIDS = SimpleNamespace(
+    upright=SymbolicUprightBox,
+    box=_box,
+    ball=SymbolicCapsule,
+    capsule=_capsule,
+    cylinder=SymbolicCylinder,
+    hull=_hull,
+)
 
 
 def symbolic_solids(state: SymbolicState) -> list[SymbolicSolid]:
     """Return the shapes of the obstacles around a robot."""
-    makers = SolidMakers()
     parts = [state.obstacle_poses[part] for part in number_slices(state.obstacles)]
     return [
-        obstacle.form.symbolic(values, makers)
+        obstacle.form.symbolic(values, SOLIDS)
         for obstacle, values in zip(state.obstacles, parts, strict=True)
     ]
 

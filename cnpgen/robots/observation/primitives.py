@@ -11,6 +11,7 @@ import numpy as np
 from cnpgen.arrays import AnyArray, Array, Integers
 from cnpgen.errors import UsageError
 from cnpgen.robots.obstacle import Obstacle
+from cnpgen.robots.obstacle_shapes.cylinder_shape import CylinderShape
 from cnpgen.robots.obstacle_shapes.obstacle_shape import (
     ObstacleShape,
     SizedShape,
@@ -41,6 +42,9 @@ class ConvexMesh:
             [m], shape (T, 3, 3).
         planes: Outer unit normals n and offsets c of the faces, shape (F, 4): ``n @ x +
             c <= 0`` inside.
+        core: Corners of the hull with ``radius`` around it, for which the mesh stands
+            [m], shape (C, 3).
+        radius: Radius [m].
     """
 
     center: Array
@@ -48,6 +52,8 @@ class ConvexMesh:
     corners: Array
     triangles: Array
     planes: Array
+    core: Array
+    radius: float
 
 
 @lru_cache(MAX_KEPT_MESHES)
@@ -55,6 +61,7 @@ def convex_mesh(shape: ObstacleShape) -> ConvexMesh:
     """Return the mesh of the surface of a shape; round edges have corners in directions 7.5 degrees apart."""
     from scipy.spatial import ConvexHull
 
+    core, radius = shape.polytope()
     corners = shape.surface()
     center = (corners.max(axis=0) + corners.min(axis=0)) / 2
     half = np.ptp(corners, axis=0) / 2
@@ -71,7 +78,10 @@ def convex_mesh(shape: ObstacleShape) -> ConvexMesh:
     # A corner and two edges, the form that distances and areas need.
     triangles = np.stack([first, second - first, third - first], axis=1)
     areas = np.linalg.norm(np.cross(triangles[:, 1], triangles[:, 2]), axis=1) / 2
-    return ConvexMesh(center, half, hull.points, triangles[areas > MIN_AREA_M2], planes)
+    triangles = triangles[areas > MIN_AREA_M2]
+    return ConvexMesh(
+        center, half, hull.points, triangles, planes, core - center, radius
+    )
 
 
 @dataclass(frozen=True, eq=False)
@@ -114,11 +124,14 @@ class Primitives:
         )
 
 
-def primitives_of(obstacles: Sequence[Obstacle], numbers: Array) -> Primitives:
+def primitives_of(
+    obstacles: Sequence[Obstacle], numbers: Array, *, with_prisms: bool = False
+) -> Primitives:
     """Return obstacles as primitives.
 
     Poses and sizes (``cnpgen.robots.solid``) have shape (pose_width,), or of N samples
-    (N, pose_width), which gives arrays with a first axis of length N.
+    (N, pose_width), which gives arrays with a first axis of length N. ``with_prisms``
+    returns cylinders that contain the prisms of judges.
     """
     samples = numbers.shape[:-1]
     rows = np.atleast_2d(numbers)
@@ -135,6 +148,9 @@ def primitives_of(obstacles: Sequence[Obstacle], numbers: Array) -> Primitives:
         else:
             kinds[:, index] = MESH + len(meshes)
             meshes.append(_fill_mesh(obstacle, rows[:, part], *of_body))
+    if not with_prisms:
+        cylinders = kinds == KINDS.index("cylinder")
+        sizes[cylinders, 0] *= CylinderShape.radius_share
     arrays = (
         array.reshape(*samples, *array.shape[1:])
         for array in (kinds, centers, rotations, sizes)

@@ -10,8 +10,6 @@ import numpy as np
 from cnpgen.arrays import Array, Vector3
 from cnpgen.robots.obstacle_shapes.convex_solid import Box, Solid, solid_around
 from cnpgen.robots.obstacle_shapes.obstacle_shape import (
-    BOX,
-    CompiledRecord,
     SizedShape,
 )
 from cnpgen.robots.shape.hull import CUBE
@@ -53,11 +51,6 @@ class BoxShape(SizedShape):
         if numbers.shape[1] > 6:
             rotation[:] = numbers[:, 6:].reshape(-1, 3, 3)
 
-    def record(self, numbers: Array) -> CompiledRecord:
-        """See ``ObstacleShape``."""
-        turn = numbers[6:].reshape(-1, 3) if len(numbers) > 6 else np.eye(3)
-        return CompiledRecord(BOX, numbers[:3], turn, numbers[3:6])
-
     def symbolic(self, values: Any, makers: Any) -> Any:
         """See ``ObstacleShape``."""
         return makers.box(values[3:6], values[:3], values[6:])
@@ -90,10 +83,6 @@ class UprightBox(SizedShape):
         height = self.height or UNBOUNDED_OBSTACLE_HEIGHT_M
         return np.array([self.x.high - self.x.low, self.y.high - self.y.low, height])
 
-    def _center(self, top: Any) -> Array:
-        x, y, z = (self.x.low + self.x.high) / 2, (self.y.low + self.y.high) / 2, top
-        return np.stack(np.broadcast_arrays(x, y, z - self._edges[2] / 2), axis=-1)
-
     def polytope(self) -> tuple[Array, float]:
         """See ``ObstacleShape``."""
         return CUBE * self._edges, 0.0
@@ -101,23 +90,23 @@ class UprightBox(SizedShape):
     def solid(self, numbers: Array) -> Solid:
         """See ``ObstacleShape``."""
         (top,) = numbers
+        x, y = (self.x.low + self.x.high) / 2, (self.y.low + self.y.high) / 2
+        center = np.array([x, y, top - self._edges[2] / 2])
         low = np.array([self.x.low, self.y.low, top - self._edges[2]])
         high = np.array([self.x.high, self.y.high, top])
-        return Box(self._center(top), self.polytope()[0], low, high)
+        return Box(center, self.polytope()[0], low, high)
 
     def place(
         self, numbers: Array, center: Array, rotation: Array, size: Array
     ) -> None:
         """See ``SizedShape``."""
         del rotation  # is a unit
-        center[:] = self._center(numbers[:, 0])
+        top = numbers[:, 0]
+        low = top - self._edges[2]
+        center[:, :2] = (self.x.low + self.x.high) / 2, (self.y.low + self.y.high) / 2
+        center[:, 2] = (low + top) / 2
         size[:] = self._edges / 2
-
-    def record(self, numbers: Array) -> CompiledRecord:
-        """See ``ObstacleShape``."""
-        solid = self.solid(numbers)
-        center, half = (solid.low + solid.high) / 2, (solid.high - solid.low) / 2
-        return CompiledRecord(BOX, center, np.eye(3), half)
+        size[:, 2] = (top - low) / 2
 
     def symbolic(self, values: Any, makers: Any) -> Any:
         """See ``ObstacleShape``."""

@@ -11,12 +11,9 @@ import numpy as np
 from cnpgen.arrays import Array
 from cnpgen.robots.obstacle_shapes.convex_solid import Solid, solid_around
 from cnpgen.robots.obstacle_shapes.obstacle_shape import (
-    BOX,
-    CYLINDER,
-    CompiledRecord,
     SizedShape,
 )
-from cnpgen.robots.shape.hull import frame_along, frames_along
+from cnpgen.robots.shape.hull import frames_along
 from cnpgen.schema.keys import field
 
 
@@ -28,7 +25,6 @@ class AxialShape(SizedShape):
     length: float = field("length along the z axis", unit="m", low=1e-6)
 
     radius_share: ClassVar[float] = 1.0  # of the radius among the numbers
-    compiled: ClassVar[int] = BOX
 
     widths = (7, 7)
 
@@ -43,21 +39,11 @@ class AxialShape(SizedShape):
         self, numbers: Array, center: Array, rotation: Array, size: Array
     ) -> None:
         """See ``SizedShape``."""
-        half = np.linalg.norm(numbers[:, 3:6], axis=1)
+        half = np.array([math.hypot(*vector) for vector in numbers[:, 3:6]])
         center[:] = numbers[:, :3]
         rotation[:] = frames_along(numbers[:, 3:6], half)
-        size[:, 0] = numbers[:, 6] * self.radius_share
+        size[:, 0] = numbers[:, 6]
         size[:, 1] = half
-
-    def record(self, numbers: Array) -> CompiledRecord:
-        """See ``ObstacleShape``."""
-        length = math.hypot(*numbers[3:6])
-        rotation = frame_along(numbers[3:6].tolist(), length)
-        radius = numbers[6]
-        # A capsule is a box without extent across its axis, with a radius around it.
-        across, around = (radius, 0.0) if self.compiled == CYLINDER else (0.0, radius)
-        half = np.array([across, across, length])
-        return CompiledRecord(self.compiled, numbers[:3], rotation, half, around)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -11,9 +11,6 @@ import numpy as np
 from cnpgen.arrays import Array
 from cnpgen.robots.obstacle_shapes.capsule_shape import AxialShape
 from cnpgen.robots.obstacle_shapes.convex_solid import Solid, solid_around
-from cnpgen.robots.obstacle_shapes.obstacle_shape import (
-    CYLINDER,
-)
 from cnpgen.robots.shape.hull import frame_along
 
 # Of the prism that contains a cylinder; its corners exceed the radius by 0.12 %.
@@ -29,8 +26,6 @@ class CylinderShape(AxialShape):
     """A cylinder; the radius among its numbers is that of the corners of the prism round it."""
 
     radius_share = math.cos(math.pi / PRISM_SIDES)
-    # With the radius of the prism's corners it contains the prism.
-    compiled = CYLINDER
 
     def polytope(self) -> tuple[Array, float]:
         """See ``ObstacleShape``."""

@@ -10,7 +10,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from functools import cache
-from typing import Any, ClassVar, NamedTuple, get_args
+from typing import Any, ClassVar, get_args
 from xml.etree.ElementTree import Element
 
 import numpy as np
@@ -22,29 +22,6 @@ from cnpgen.robots.shape.inline import address_of
 from cnpgen.robots.urdf import numbers_text
 from cnpgen.schema import registry
 from cnpgen.schema.keys import keys
-
-HULL, BOX, CYLINDER = 0, 1, 2  # kinds of bodies in convex.c
-
-
-class CompiledRecord(NamedTuple):
-    """A body of ``convex.c``: a hull of corners, a box or a flat cylinder along z, with a radius around it.
-
-    Attributes:
-        kind: ``HULL``, ``BOX`` or ``CYLINDER``.
-        position: Origin of its frame [m], shape (3,).
-        rotation: Rotation matrix of its frame, shape (3, 3).
-        half: Half the edge lengths of a box, or radius, radius and half the length of a
-            cylinder [m], shape (3,); of a hull those of its bounding box.
-        radius: Radius around it [m].
-        corners: Corners of a hull in its frame [m], shape (V, 3).
-    """
-
-    kind: int
-    position: Array
-    rotation: Array
-    half: Array
-    radius: float = 0.0
-    corners: Array | None = None
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -95,17 +72,10 @@ class ObstacleShape(ABC):
         corners, radius = self.polytope()
         return solid_around(numbers[:3], corners @ numbers[3:].reshape(3, 3).T, radius)
 
-    def record(self, numbers: Array) -> CompiledRecord:
-        """Return the body that compiled code measures."""
-        corners, radius = self.polytope()
-        half = (corners.max(axis=0) - corners.min(axis=0)) / 2
-        rotation = numbers[3:].reshape(3, 3)
-        return CompiledRecord(HULL, numbers[:3], rotation, half, radius, corners)
-
     def symbolic(self, values: Any, makers: Any) -> Any:
         """Return the body that solvers differentiate, from numbers as SX, a list of length width.
 
-        ``makers`` are ``SolidMakers`` of ``cnpgen.kernels``. Shapes do not import them:
+        ``makers`` are ``SOLIDS`` of ``cnpgen.kernels``. Shapes do not import them:
         judges use shapes, and share no code with solvers.
         """
         return makers.hull(*self.polytope(), values[:3], values[3:])
@@ -133,7 +103,8 @@ class SizedShape(ObstacleShape):
     ) -> None:
         """Fill in centers (N, 3), rotations (N, 3, 3), which are units, and sizes (N, 3), which are 0 [m].
 
-        Sizes are those of ``Primitives``; numbers have shape (N, width).
+        Sizes are those of ``Primitives``, but a radius is that among the numbers, which
+        have shape (N, width).
         """
 
     @staticmethod

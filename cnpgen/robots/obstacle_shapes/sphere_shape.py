@@ -10,8 +10,6 @@ import numpy as np
 from cnpgen.arrays import Array
 from cnpgen.robots.obstacle_shapes.convex_solid import Solid, solid_around
 from cnpgen.robots.obstacle_shapes.obstacle_shape import (
-    BOX,
-    CompiledRecord,
     SizedShape,
 )
 from cnpgen.schema.keys import field
@@ -47,16 +45,9 @@ class SphereShape(SizedShape):
         center[:] = numbers[:, :3]
         size[:, 0] = numbers[:, 3]
 
-    def record(self, numbers: Array) -> CompiledRecord:
-        """See ``ObstacleShape``."""
-        # A box of size 0 with a radius.
-        return CompiledRecord(
-            BOX, numbers[:3], np.eye(3), np.zeros(3), float(numbers[3])
-        )
-
     def symbolic(self, values: Any, makers: Any) -> Any:
         """See ``ObstacleShape``."""
-        return makers.capsule(values[:3], None, values[3])
+        return makers.ball(values[:3], values[:3], values[3])
 
     @staticmethod
     def depths(local: Array, size: Array) -> Array:

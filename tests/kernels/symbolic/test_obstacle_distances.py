@@ -7,7 +7,7 @@ import pytest
 import scipy
 
 from cnpgen.kernels.symbolic.linalg import symbols
-from cnpgen.kernels.symbolic.obstacle_distances import SolidMakers
+from cnpgen.kernels.symbolic.obstacle_distances import SOLIDS
 from cnpgen.robots.obstacle import Obstacle
 from cnpgen.robots.shape.hull import supporting_planes
 from cnpgen.robots.shape.inline import corners_of
@@ -39,7 +39,7 @@ def forms(obstacle: Obstacle) -> ca.Function:
         symbols("ends", 6),
         symbols("numbers", len(place_obstacles([obstacle]))),
     )
-    solid = obstacle.form.symbolic(numbers, SolidMakers())
+    solid = obstacle.form.symbolic(numbers, SOLIDS)
     first, second = ends[:3], ends[3:]
     values = [
         solid.separation(first, second, lambda value: value),
@@ -97,7 +97,7 @@ def test_distances_of_cuboids_are_lower_bounds(kind: str) -> None:
         obstacle = draw_obstacle(kind, random)
         numbers_sx, numbers = symbols("numbers", len(place_obstacles([obstacle])))
         (place_sx, place), (turn_sx, turn) = symbols("place", 3), symbols("turn", 9)
-        found = obstacle.form.symbolic(numbers, SolidMakers()).cuboid_separation(
+        found = obstacle.form.symbolic(numbers, SOLIDS).cuboid_separation(
             place, [turn[:3], turn[3:6], turn[6:]], SIZE
         )
         function = ca.Function("cuboid", [place_sx, turn_sx, numbers_sx], [found])
@@ -159,7 +159,7 @@ def test_an_upright_object_on_a_round_pedestal_has_distance_zero() -> None:
     )
     numbers = place_obstacles([stand])
     form, upright = (
-        stand.form.symbolic(list(numbers), SolidMakers()),
+        stand.form.symbolic(list(numbers), SOLIDS),
         [[1.0, 0, 0], [0, 1.0, 0], [0, 0, 1.0]],
     )
     for gap in (-1e-3, 0.0, 0.02):
