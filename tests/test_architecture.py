@@ -338,9 +338,14 @@ def test_every_entry_point_names_an_object_of_an_addon() -> None:
 
 
 def defines(module: Path, attribute: str) -> bool:
-    """Return whether a module defines or imports a name."""
+    """Return whether a module defines, assigns or imports a name."""
     return any(
         getattr(node, "name", None) == attribute
+        or (
+            isinstance(node, ast.Name)
+            and isinstance(node.ctx, ast.Store)
+            and node.id == attribute
+        )
         or (
             isinstance(node, ast.Import | ast.ImportFrom)
             and attribute in {alias.asname or alias.name for alias in node.names}

@@ -21,6 +21,7 @@ from cnpgen.cli.main import main
 from cnpgen.errors import PluginError, RecipeError, UsageError
 from cnpgen.kernels.symbolic.linalg import symbols
 from cnpgen.kernels.symbolic.obstacle_distances import SOLIDS
+from cnpgen.plans.scene_plans import scene_plans
 from cnpgen.problems.load_robot import load_robot
 from cnpgen.problems.problem import Problem, resolved
 from cnpgen.problems.problem_file import load_problem, restore_problem
@@ -206,3 +207,5 @@ def test_scenes_refuse_the_shape_of_a_package(problem: Problem) -> None:
     scene = SceneProblem("one", problem.obstacle, np.zeros(4), np.zeros((1, 4)))
     with pytest.raises(UsageError, match="cone"):
         checked_scene(scene)
+    with pytest.raises(UsageError, match="cone"):
+        scene_plans(problem, [scene])

@@ -265,12 +265,23 @@ def check_scenes(scenes: Sequence[SceneProblem]) -> None:
             )
         if error := invalid_obstacle(scene.obstacles):
             raise SceneError(f"{scene.place}: {error}")
+        _refuse_packages(scene)
         for name, axes, expected in (("start_q", 1, "(n,)"), ("goal_q", 2, "(G, n)")):
             shape = np.shape(getattr(scene, name))
             if len(shape) != axes:
                 raise SceneError(
                     f"{scene.place}: {name} must have shape {expected}, got {shape}"
                 )
+
+
+def _refuse_packages(scene: SceneProblem) -> None:
+    """Raise SceneError for the shape of a package: capacities and files of scenes do not name its dimensions."""
+    for obstacle in scene.obstacles:
+        if obstacle.shape is not None:
+            raise SceneError(
+                f"{scene.place}: obstacle {obstacle.name!r} has the shape of a package, which problem files alone may"
+                " have: give its hull, see make_mesh"
+            )
 
 
 def _check_pose(pose: GoalPose, place: str) -> None:
@@ -311,6 +322,7 @@ def _check_pose(pose: GoalPose, place: str) -> None:
 def checked_scene(scene: SceneProblem) -> SceneProblem:
     """Check a scene and return it with unique names of obstacles."""
     check_count(len(scene.obstacles), scene.place)
+    _refuse_packages(scene)
     for pose in (scene.goal_pose, *scene.other_goal_poses):
         if pose is not None:
             _check_pose(pose, scene.place)
@@ -323,11 +335,6 @@ def checked_scene(scene: SceneProblem) -> SceneProblem:
         if obstacle.kind == "mesh" and not is_inline(obstacle.mesh):
             raise SceneError(
                 f"{scene.place}: obstacle {obstacle.name!r} is a mesh file, expected corners: see make_mesh"
-            )
-        if obstacle.shape is not None:
-            raise SceneError(
-                f"{scene.place}: obstacle {obstacle.name!r} has the shape of a package, which problem files alone may have:"
-                " give its hull, see make_mesh"
             )
     counts = len(scene.start_q), len(scene.goal_q), len(scene.obstacles)
     if error := next(scene.request.errors(*counts), ""):
