@@ -110,8 +110,9 @@ class Obstacle:
             if not isinstance(value, kind | None):
                 yield name, f"must be a {kind.__name__}, got {value!r}"
                 return
-        for key in keys(type(self)):
-            value = getattr(self, key.name)
+        owners = [each for each in (self, self.shape) if each is not None]
+        for owner, key in [(each, key) for each in owners for key in keys(type(each))]:
+            value = getattr(owner, key.name)
             ends = (value.low, value.high) if isinstance(value, Range) else value
             entries = ends if isinstance(ends, tuple) else (ends,)
             numbers = [entry for entry in entries if isinstance(entry, int | float)]

@@ -2,6 +2,7 @@
 
 import importlib
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import casadi as ca
@@ -201,6 +202,18 @@ def test_wrong_tables_are_refused(problem: Problem, tmp_path: Path) -> None:
         with pytest.raises(RecipeError) as error:
             load_problem(table)
         assert any(key in text for text in error.value.errors), error.value.errors
+
+
+@pytest.mark.parametrize(
+    ("name", "value"), [("radius", np.nan), ("top_radius", -0.1), ("length", 1e9)]
+)
+def test_dimensions_of_python_are_checked(
+    problem: Problem, name: str, value: float
+) -> None:
+    (obstacle,) = problem.obstacle
+    shape = replace(obstacle.shape, **{name: value})
+    with pytest.raises(UsageError, match=name):
+        problem.with_obstacles([replace(obstacle, shape=shape)])
 
 
 def test_scenes_refuse_the_shape_of_a_package(problem: Problem) -> None:

@@ -1,5 +1,6 @@
 """Obstacles of every kind in the collision world: comparison with Coal's own shapes and the URDF's own geometry."""
 
+from functools import partial
 from pathlib import Path
 
 import coal
@@ -7,8 +8,11 @@ import numpy as np
 import pytest
 import scipy
 
+from cnpgen.errors import UsageError
 from cnpgen.problems.load_robot import load_robot
 from cnpgen.problems.problem_file import load_problem
+from cnpgen.problems.scenes.scene_problem import make_mesh
+from cnpgen.robots.shape.hull import coal_hull
 from cnpgen.robots.solid import place_obstacles, solids_of
 from cnpgen.world.collision_world import CollisionWorld
 from cnpgen.world.path import PathWorld
@@ -144,3 +148,30 @@ def test_an_obstacle_below_the_object_touches_it() -> None:
         )
         poses = [solids_of([obstacle], each)[0].high[2] for each in numbers]
         np.testing.assert_allclose(poses, [0.28, 0.48], atol=1e-12)
+
+
+def prism(sides: int, *, apex: bool = False) -> np.ndarray:
+    """Corners of a prism along z [m], shape (V, 3), or of a pyramid."""
+    angles = np.arange(sides) * 2 * np.pi / sides
+    circle = 0.1 * np.column_stack([np.cos(angles), np.sin(angles), 0 * angles])
+    top = np.array([[0, 0, 2.0]]) if apex else np.add(circle, [0, 0, 1.0])
+    return np.concatenate([circle - [0, 0, 1.0], top])
+
+
+def test_distances_from_flat_faces_of_hundreds_of_corners_are_exact() -> None:
+    obstacle = make_mesh("disc", prism(600), (0.5, 0, 0))
+    world = CollisionWorld(None)
+    world.place(solids_of([obstacle], place_obstacles([obstacle])))
+    random = np.random.default_rng(0)
+    heights, shifts = random.uniform(1.01, 2, 50), random.uniform(-0.05, 0.05, (50, 2))
+    ends = [
+        ((0.5 + x, y, z), (0.5 + x, y, z + 0.3))
+        for (x, y), z in zip(shifts.tolist(), heights.tolist(), strict=True)
+    ]
+    np.testing.assert_allclose(world.segment_distances(ends), heights - 1, atol=1e-9)
+
+
+def test_a_corner_with_too_many_edges_is_refused_by_name() -> None:
+    for refuse in (coal_hull, partial(make_mesh, "pyramid")):
+        with pytest.raises(UsageError, match="300 edges"):
+            refuse(prism(300, apex=True))

@@ -78,35 +78,35 @@ class UprightBox(SizedShape):
     height_place = 0
     widths = (1, 1)
 
-    @property
-    def _edges(self) -> Array:
-        height = self.height or UNBOUNDED_OBSTACLE_HEIGHT_M
-        return np.array([self.x.high - self.x.low, self.y.high - self.y.low, height])
+    def _bounds(self, top: Any) -> tuple[Array, Array]:
+        """Return lower and upper corners [m], shape (..., 3), at heights of the upper face, shape (...)."""
+        low = top - (self.height or UNBOUNDED_OBSTACLE_HEIGHT_M)
+        ends = (self.x.low, self.y.low, low), (self.x.high, self.y.high, top)
+        first, second = (np.stack(np.broadcast_arrays(*end), axis=-1) for end in ends)
+        return first, second
 
     def polytope(self) -> tuple[Array, float]:
         """See ``ObstacleShape``."""
-        return CUBE * self._edges, 0.0
+        height = self.height or UNBOUNDED_OBSTACLE_HEIGHT_M
+        edges = self.x.high - self.x.low, self.y.high - self.y.low, height
+        return CUBE * edges, 0.0
 
     def solid(self, numbers: Array) -> Solid:
         """See ``ObstacleShape``."""
-        (top,) = numbers
-        x, y = (self.x.low + self.x.high) / 2, (self.y.low + self.y.high) / 2
-        center = np.array([x, y, top - self._edges[2] / 2])
-        low = np.array([self.x.low, self.y.low, top - self._edges[2]])
-        high = np.array([self.x.high, self.y.high, top])
-        return Box(center, self.polytope()[0], low, high)
+        low, high = self._bounds(numbers[0])
+        center = (low + high) / 2
+        corners, _ = self.polytope()
+        # The mean of both faces would be rounded as a depth without lower end is.
+        center[2] = high[2] - corners[-1, 2]
+        return Box(center, corners, low, high)
 
     def place(
         self, numbers: Array, center: Array, rotation: Array, size: Array
     ) -> None:
         """See ``SizedShape``."""
         del rotation  # is a unit
-        top = numbers[:, 0]
-        low = top - self._edges[2]
-        center[:, :2] = (self.x.low + self.x.high) / 2, (self.y.low + self.y.high) / 2
-        center[:, 2] = (low + top) / 2
-        size[:] = self._edges / 2
-        size[:, 2] = (top - low) / 2
+        low, high = self._bounds(numbers[:, 0])
+        center[:], size[:] = (low + high) / 2, (high - low) / 2
 
     def symbolic(self, values: Any, makers: Any) -> Any:
         """See ``ObstacleShape``."""

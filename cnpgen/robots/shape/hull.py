@@ -24,11 +24,12 @@ MAX_CORNERS = 10_000  # of a body; finer meshes take minutes without benefit
 # Of the body that replaces a finer one; it is about 0.1 % larger.
 ENCLOSING_PLANES = 2_000
 BALL = 12  # directions per quarter of a circle in which round bodies have corners
+MAX_EDGES = 255  # at a corner of a body of Coal
 MAX_COORDINATE_M = 1e4  # larger coordinates are treated as errors of units
 
 
 def check_solid(corners: Array) -> None:
-    """Raise ValueError for coplanar, too few or too many corners, shape (V, 3), of untrusted input."""
+    """Raise ValueError for coplanar, too few or too many corners or edges, shape (V, 3), of untrusted input."""
     from scipy.spatial import ConvexHull, QhullError
 
     if len(corners) > MAX_CORNERS:
@@ -37,11 +38,12 @@ def check_solid(corners: Array) -> None:
         )
 
     try:
-        ConvexHull(corners)
+        hull = ConvexHull(corners)
     except (QhullError, ValueError) as error:
         raise ValueError(
             f"its {len(corners)} corners are not those of a body"
         ) from error
+    _triangles_of(hull)
 
 
 def hull_corners(points: Array) -> Array:
@@ -172,22 +174,51 @@ def ball_round(corners: Array, radius: float) -> tuple[Array, float]:
 def coal_hull(corners: Array) -> "coal.Convex":
     """Return a convex hull of corners [m], shape (V, 3), as a Coal shape.
 
-    Three are a triangle, two a segment.
+    Three are a triangle, two a segment. UsageError for a corner with too many edges.
     """
     import coal
     from scipy.spatial import ConvexHull, QhullError
 
     try:
         triangles = (
-            ConvexHull(corners).simplices
+            _triangles_of(ConvexHull(corners))
             if len(corners) > 3
             else [np.arange(3) % len(corners)]
         )
     except (QhullError, ValueError) as error:
+        reason = str(error).splitlines()[0]
         raise UsageError(
-            f"corners from {corners.min(axis=0)} to {corners.max(axis=0)} m have no convex hull"
+            f"corners from {corners.min(axis=0)} to {corners.max(axis=0)} m have no convex hull: {reason}"
         ) from error
     return coal.Convex(*coal_vectors(corners, triangles))
+
+
+def _triangles_of(hull: Any) -> Integers:
+    """Return triangles of Qhull's hull with at most ``MAX_EDGES`` at a corner, shape (T, 3); ValueError if it has more."""
+    triangles: Integers = hull.simplices
+    if np.bincount(triangles.ravel()).max() <= MAX_EDGES:
+        return triangles
+    # Qhull divides a flat face into a fan, whose first corner has an edge to all
+    # others. In a strip that goes from side to side, each corner has at most four.
+    _, face_of = np.unique(hull.equations.round(9), axis=0, return_inverse=True)
+    strips = []
+    for face in range(face_of.max() + 1):
+        own = face_of.ravel() == face
+        around = np.unique(triangles[own])
+        axes = frame_along(hull.equations[own][0, :3].tolist(), 1.0)[:, :2]
+        points = hull.points[around]
+        x, y = ((points - points.mean(axis=0)) @ axes).T
+        order = around[np.argsort(np.arctan2(y, x))]
+        # 0, 1, -1, 2, -2, ...
+        sides = [(i + 1) // 2 * (1 if i % 2 else -1) for i in range(len(order))]
+        strip = order[sides]
+        strips.append(np.column_stack([strip[:-2], strip[1:-1], strip[2:]]))
+    triangles = np.concatenate(strips)
+    if (most := int(np.bincount(triangles.ravel()).max())) > MAX_EDGES:
+        raise ValueError(
+            f"it has a corner with {most} edges, expected at most {MAX_EDGES}: give fewer corners"
+        )
+    return triangles
 
 
 def coal_vectors(points: Array, triangles: Iterable[Any]) -> tuple[Any, Any]:
