@@ -196,7 +196,7 @@ def refine_and_save(
     return 0 if found.valid.all() else 1
 
 
-def _identity(plans: "Plans", options: "RefineOptions") -> list[str]:
+def _identity(plans: "Plans", options: "RefineOptions") -> list[object]:
     """Return what identifies a run and the columns of its result."""
     import joblib
 

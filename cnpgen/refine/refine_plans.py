@@ -13,6 +13,7 @@ from pathlib import Path
 
 import numpy as np
 
+from cnpgen.documents import JsonObject
 from cnpgen.machine.engine import Engine, assembled
 from cnpgen.machine.threads import one_thread
 from cnpgen.machine.times import Stopwatch
@@ -160,7 +161,7 @@ def refine_tasks(
                 progress(len(results), sum(result.valid for result in results.values()))
     finally:
         if file is not None:
-            file.close()
+            file.file.close()
     # One row of every group has a result.
     chosen = [row for rows in groups for row in rows if row in finished]
     kept = plans if len(groups) == len(plans) else plans[chosen]
@@ -185,7 +186,7 @@ def _run(
     hint = (
         ""
         if journal is None
-        else f": {journal.path} has the finished plans; the same call with the same arguments resumes"
+        else f": {journal.file.path} has the finished plans; the same call with the same arguments resumes"
     )
     with assembled(
         engine,
@@ -262,8 +263,8 @@ def _refinement(
 
 def identity_of_run(
     plans: Plans, options: RefineOptions, *, tasks: int | None = None
-) -> str:
-    """Return the JSON text that identifies a run: version, options, number of tasks and a checksum of the plans."""
+) -> JsonObject:
+    """Return what identifies a run, JSON-able: version, options, number of tasks and a checksum of the plans."""
     digest = hashlib.sha256(plans.problem.recipe.encode() + plans.problem.urdf.encode())
     boundary = [
         values for values in vars(plans.boundary).values() if values is not None
@@ -283,12 +284,10 @@ def identity_of_run(
         digest.update(
             str(values.shape).encode() + np.ascontiguousarray(values).tobytes()
         )
-    return json.dumps(
-        {
-            "version": __version__,
-            "options": options.document(),
-            "degree": plans.degree,
-            "tasks": len(plans) if tasks is None else tasks,
-            "plans": digest.hexdigest(),
-        }
-    )
+    return {
+        "version": __version__,
+        "options": options.document(),
+        "degree": plans.degree,
+        "tasks": len(plans) if tasks is None else tasks,
+        "plans": digest.hexdigest(),
+    }

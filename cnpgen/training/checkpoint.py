@@ -3,31 +3,26 @@
 import json
 import math
 import time
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from cnpgen.arrays import AnyArray, Mask
 from cnpgen.documents import JsonMapping, JsonObject
 from cnpgen.errors import DatasetError, UsageError
-from cnpgen.store.files.checksum_file import (
-    Content,
-    read_with_checksum,
-    write_with_checksum,
-)
 from cnpgen.store.files.document_structure import (
     ANY_KEY,
     ANYTHING,
     NUMBER,
+    TEXT,
     WHOLE,
     check_structure,
 )
-from cnpgen.store.files.documents import differences, parse_json
+from cnpgen.store.files.record_file import RecordFormat, pack_arrays, unpack_arrays
 from cnpgen.training.adam import Adam, Clipping, start_adam
 
-CHECKPOINT_KIND = "cnpgen-checkpoint"
-CHECKPOINT_VERSION = 2
 MIN_INTERVAL_S, MAX_INTERVAL_S = 20.0, 50.0  # wall time between two checkpoints
 INTERVAL_PER_WRITING_TIME = 20.0
 _ADAM_ARRAYS = ("parameters", "average", "first", "second")
@@ -118,12 +113,11 @@ def start_state(
     )
 
 
-def to_content(state: State) -> Content:
-    """Convert a state to arrays and texts."""
+def _pack(state: State) -> JsonObject:
     adam = state.adam
     best = state.best
     arrays = {name: getattr(adam, name) for name in _ADAM_ARRAYS}
-    numbers = {
+    return {
         "step": adam.step,
         **{name: getattr(state, name) for name in _STATE_NUMBERS},
         "clipping": asdict(state.clipping),
@@ -131,11 +125,11 @@ def to_content(state: State) -> Content:
             name: value for name, value in vars(state.sums).items() if name != "terms"
         },
         "best": {"score": best.score, "step": best.step},
+        "log": state.log,
+        "arrays": pack_arrays(
+            {**arrays, "best": best.parameters, "terms": state.sums.terms}
+        ),
     }
-    texts = {"numbers": json.dumps(numbers, indent=1), "log": "\n".join(state.log)}
-    return Content(
-        {**arrays, "best": best.parameters, "terms": state.sums.terms}, texts
-    )
 
 
 _FORM = {
@@ -145,34 +139,42 @@ _FORM = {
     "metric": {ANY_KEY: ANYTHING},
     "sums": {"steps": WHOLE, "lost": WHOLE, "distance": NUMBER, "imitating": WHOLE},
     "best": {"score": NUMBER, "step": WHOLE},
+    "log": [TEXT],
+    "arrays": TEXT,
 }
 
 
-def from_content(content: Content) -> State:
-    """Make a state from arrays and texts.
+def _unpack(record: Any) -> State:
+    """Make a state of a record.
 
     Raises:
         KeyError, TypeError, ValueError: A key is missing, unknown to this version, or
             has an invalid value.
     """
-    numbers = parse_json(content.texts["numbers"])
-    arrays = content.arrays
-    check_structure(numbers, _FORM)
-    best = numbers["best"]
+    check_structure(record, _FORM)
+    best = record["best"]
+    arrays = unpack_arrays(record["arrays"])
     shapes = {arrays[name].shape for name in (*_ADAM_ARRAYS, "best")}
     if len(shapes) > 1 or len(shapes.pop()) != 1 or arrays["terms"].ndim != 1:
         raise ValueError("its arrays do not belong to one network")
     return State(
-        Adam(
-            **{name: np.array(arrays[name]) for name in _ADAM_ARRAYS},
-            step=numbers["step"],
-        ),
-        Clipping(**numbers["clipping"]),
-        Sums(np.array(arrays["terms"]), **numbers["sums"]),
-        Best(best["score"], best["step"], np.array(arrays["best"])),
-        **{name: numbers[name] for name in _STATE_NUMBERS},
-        log=content.texts["log"].splitlines(),
+        Adam(**{name: arrays[name] for name in _ADAM_ARRAYS}, step=record["step"]),
+        Clipping(**record["clipping"]),
+        Sums(arrays["terms"], **record["sums"]),
+        Best(best["score"], best["step"], arrays["best"]),
+        **{name: record[name] for name in _STATE_NUMBERS},
+        log=record["log"],
     )
+
+
+CHECKPOINT = RecordFormat(
+    "cnpgen-checkpoint",
+    3,
+    "a checkpoint of cnpgen",
+    "give the same arguments to resume it, or {force} to replace it",
+    "force",
+    _unpack,
+)
 
 
 class Checkpoints:
@@ -204,23 +206,12 @@ class Checkpoints:
             raise
 
     def _load(self) -> State:
-        content = read_with_checksum(
-            self.path, kind=CHECKPOINT_KIND, version=CHECKPOINT_VERSION
-        )
-        try:
-            identity = parse_json(content.texts["identity"])
-            state = from_content(content)
-        except (KeyError, TypeError, ValueError) as error:
-            raise DatasetError(
-                f"{self.path} does not fit this version of cnpgen: {error!r}"
-            ) from error
-        changed = list(map(str, differences(identity, self.identity)))
-        if changed:
-            raise UsageError(
-                f"{self.path} is of another run, it differs in {', '.join(changed[:4])}: give the same arguments to"
-                " resume it, or {force} to replace it",
-                remedies={"force": True},
-            )
+        head, records = CHECKPOINT.read(self.path)
+        CHECKPOINT.require(self.path, head or {}, self.identity)
+        if len(records) != 1:
+            raise DatasetError(f"{self.path} is damaged or cut off")
+        state: State
+        (state,) = CHECKPOINT.unpacked(self.path, records)
         return state
 
     def save_if_due(self, state: State) -> None:
@@ -231,13 +222,7 @@ class Checkpoints:
     def save(self, state: State) -> None:
         """Save the state."""
         started = time.monotonic()
-        content = to_content(state)
-        content = replace(
-            content, texts={**content.texts, "identity": json.dumps(self.identity)}
-        )
-        write_with_checksum(
-            self.path, content, kind=CHECKPOINT_KIND, version=CHECKPOINT_VERSION
-        )
+        CHECKPOINT.replace(self.path, self.identity, _pack(state))
         # Writing takes at most a twentieth of the time, within the bounds of the
         # interval.
         interval = INTERVAL_PER_WRITING_TIME * (time.monotonic() - started)

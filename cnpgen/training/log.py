@@ -6,10 +6,9 @@ from typing import TYPE_CHECKING
 
 from cnpgen.documents import JsonMapping, JsonObject
 from cnpgen.errors import UsageError
-from cnpgen.store.files.atomic import committing, write_file
+from cnpgen.store.files.atomic import append_to_file, committing, write_file
 from cnpgen.store.files.documents import parse_json
 from cnpgen.store.files.figure_file import new_figure
-from cnpgen.store.files.journal import append_line
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -33,7 +32,7 @@ class TrainingLog:
         """Append a record."""
         line = json.dumps(record, allow_nan=False)
         self.lines.append(line)
-        append_line(self.path, line)
+        append_to_file(self.path, f"{line}\n".encode())
 
     @property
     def text(self) -> str:

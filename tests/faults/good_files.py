@@ -1,6 +1,5 @@
 """A valid file of every kind, the starting point of changed files."""
 
-import json
 import shutil
 from dataclasses import replace
 from pathlib import Path
@@ -69,7 +68,7 @@ def make_good_files(folder: Path) -> None:
     )
     state = start_state(np.zeros(10, np.float32), terms=3, steps=10)
     Checkpoints(folder / "checkpoint", IDENTITY).save(state)
-    journal = open_journal(folder / "journal", json.dumps(IDENTITY))
+    journal = open_journal(folder / "journal", IDENTITY)
     attempt = Attempt(
         path=np.zeros((15, 6)),
         rate=np.ones(20),
@@ -79,7 +78,7 @@ def make_good_files(folder: Path) -> None:
         reason="ok",
     )
     journal.append([0], [attempt])
-    journal.close()
+    journal.file.close()
     make_scene_files(folder)
     (folder / "crane").mkdir()
     make_mesh_files(folder / "crane")
@@ -133,3 +132,4 @@ def _make_task_files(folder: Path) -> None:
             }
             | {"executed": {"nominal": {"scored": True}}}
         )
+    results.file.close()

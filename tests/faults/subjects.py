@@ -1,6 +1,6 @@
 """The kinds of untrusted files: how a valid one is changed, mostly with a valid checksum, and how it is read."""
 
-import hashlib
+import base64
 import json
 import shutil
 import warnings
@@ -33,7 +33,7 @@ from cnpgen.plans.plans import screen
 from cnpgen.problems.load_robot import load_robot
 from cnpgen.problems.problem_file import load_problem
 from cnpgen.problems.problem_record import open_problem
-from cnpgen.refine.refinement_journal import open_journal
+from cnpgen.refine.refinement_journal import JOURNAL, open_journal
 from cnpgen.store.dataset_spec import from_json
 from cnpgen.store.field import Field
 from cnpgen.store.files.atomic import file_sha256
@@ -45,10 +45,11 @@ from cnpgen.store.files.checksum_file import (
     with_checksum,
 )
 from cnpgen.store.files.documents import canonical_sha256, save_document
+from cnpgen.store.files.record_file import RecordFormat
 from cnpgen.store.inspection import inspect_dataset
 from cnpgen.store.manifest import data_fingerprint
 from cnpgen.store.shard import read_schema, read_shard
-from cnpgen.training.checkpoint import CHECKPOINT_KIND, CHECKPOINT_VERSION, Checkpoints
+from cnpgen.training.checkpoint import CHECKPOINT, Checkpoints
 from cnpgen.validate.validate_dataset import validate_dataset
 from tests.examples.documents import read_unverified
 from tests.examples.plan_files import plans_of
@@ -413,21 +414,25 @@ def _read_checkpoint(folder: Path, draw: Random) -> None:
     Checkpoints(folder / "checkpoint", IDENTITY).load()
 
 
-def _change_journal(good: Path, folder: Path, draw: Random) -> None:
-    content = (good / "journal").read_bytes()
-    if draw.random() < 0.3:
-        (folder / "journal").write_bytes(change_bytes(content, draw))
-        return
-    begin = content.index(json.dumps(IDENTITY).encode()) + len(
-        json.dumps(IDENTITY)
-    )  # of the frame of a plan
-    payload = change_bytes(content[begin + 40 :], draw)
-    head = len(payload).to_bytes(8, "little") + hashlib.sha256(payload).digest()
-    (folder / "journal").write_bytes(content[:begin] + head + payload)
+def _change_records(name: str, form: RecordFormat) -> Change:
+    def change(good: Path, folder: Path, draw: Random) -> None:
+        if draw.random() < 0.3:
+            content = change_bytes((good / name).read_bytes(), draw)
+            (folder / name).write_bytes(content)
+            return
+        _, (record,) = form.read(good / name)
+        if draw.random() < 0.5:
+            record = change_json(record, draw)
+        else:
+            archive = base64.b64decode(record["arrays"])
+            record["arrays"] = base64.b64encode(change_bytes(archive, draw)).decode()
+        form.replace(folder / name, IDENTITY, record)
+
+    return change
 
 
 def _read_journal(folder: Path, draw: Random) -> None:
-    open_journal(folder / "journal", json.dumps(IDENTITY)).close()
+    open_journal(folder / "journal", IDENTITY).file.close()
 
 
 def _suite_in(folder: Path, draw: Random) -> Path:
@@ -504,6 +509,7 @@ def _change_results(good: Path, folder: Path, draw: Random) -> None:
 
 def _read_results(folder: Path, draw: Random) -> None:
     results = open_results(folder / "results.jsonl", IDENTITY)
+    results.file.close()
     for row in results.rows.values():
         if row.get("answer") is not None:
             answer_from_dict(_PROBLEM[:1], row["answer"])
@@ -577,10 +583,10 @@ SUBJECTS: dict[str, Subject] = {
         _change_with_checksum("model.h5", MODEL_KIND, MODEL_VERSION), _read_model
     ),
     "checkpoint": Subject(
-        _change_with_checksum("checkpoint", CHECKPOINT_KIND, CHECKPOINT_VERSION),
+        _change_records("checkpoint", CHECKPOINT),
         _read_checkpoint,
     ),
-    "journal": Subject(_change_journal, _read_journal),
+    "journal": Subject(_change_records("journal", JOURNAL), _read_journal),
     "embedded": Subject(_change_embedded, _read_embedded),
     "suite": Subject(_change_text_of(_suite_in, change_text), _read_suite),
     "boundary": Subject(_change_boundary, _read_boundary),

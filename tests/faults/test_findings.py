@@ -192,5 +192,6 @@ def test_a_goal_region_without_a_size_and_an_orientation_that_is_a_number(
 def test_an_answer_in_a_row_of_results_without_its_ending(tmp_path: Path) -> None:
     results = open_results(tmp_path / "results.jsonl", {"steps": 10})
     results.append({"problem": 0, "answer": {"t": ["0,5"], "q": [[0.0]]}})
+    results.file.close()
     with is_refused(DatasetError):
         open_results(tmp_path / "results.jsonl", {"steps": 10})

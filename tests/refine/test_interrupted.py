@@ -106,7 +106,7 @@ if __name__ == "__main__":
 
 @pytest.mark.slow
 @linux
-@pytest.mark.parametrize(("limit", "workers"), [(12_000, "2"), (30_000, "1")])
+@pytest.mark.parametrize(("limit", "workers"), [(12_000, "2"), (41_000, "1")])
 def test_a_file_that_cannot_grow_is_reported_in_one_line_and_the_same_command_resumes(
     problems: Plans, solved: Plans, tmp_path: Path, limit: int, workers: str
 ) -> None:

@@ -47,7 +47,11 @@ FILES = {
     "npz": (archive(), ": it seems to be a zip archive, as .npz files are"),
     "npy": (array(), ": it seems to be an array of NumPy"),
     "gzip": (gzip.compress(b"1"), ": it seems to be a gzip archive"),
-    "journal": (b"cnpgen journal 1\n\0\0", ": it seems to be a journal of cnpgen"),
+    "journal": (
+        b'{"format": "cnpgen-journal", "format_version": 2}\t',
+        ": it seems to be a journal of cnpgen",
+    ),
+    "old journal": (b"cnpgen journal 1\n\0\0", ": it seems to be a journal of cnpgen"),
     "empty": (b"", ": it is empty"),
     "noise": (bytes(range(1, 200)), ""),
 }

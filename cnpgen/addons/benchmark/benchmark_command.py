@@ -263,11 +263,11 @@ def _run(arguments: argparse.Namespace, folder: Path) -> "Benchmark":
 def _facts(found: "Benchmark", folder: Path) -> JsonObject:
     """Return the results of all planners for JSON."""
     from cnpgen.addons.benchmark.hypothesis_tests import reference_planner
-    from cnpgen.addons.benchmark.results_file import RESULTS_FORMAT, RESULTS_VERSION
+    from cnpgen.addons.benchmark.results_file import RESULTS
 
     return {
-        "format": RESULTS_FORMAT,
-        "format_version": RESULTS_VERSION,
+        "format": RESULTS.kind,
+        "format_version": RESULTS.version,
         "suite": found.suite.name,
         "suite_version": found.suite.version,
         "problems": len(found.problems),

@@ -1,12 +1,12 @@
 """Results on disk: a file per planner and repetition, with a line of JSON for every finished problem.
 
-Further lines of a problem add the execution of its plan on one plant. An incomplete
-last line is ignored.
+Further lines of a problem add the execution of its plan on one plant.
 """
 
 import json
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field, replace
+from contextlib import suppress
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -22,7 +22,7 @@ from cnpgen.machine.versions import __version__, installed_version
 from cnpgen.plans.plans import Plans, make_plans
 from cnpgen.problems.problem import resolved
 from cnpgen.schema import addons
-from cnpgen.store.files.atomic import check_writable, machine_errors, write_file
+from cnpgen.store.files.atomic import check_writable
 from cnpgen.store.files.document_structure import (
     ANY_KEY,
     ANYTHING,
@@ -33,13 +33,10 @@ from cnpgen.store.files.document_structure import (
     Structure,
     check_structure,
 )
-from cnpgen.store.files.documents import canonical_sha256, parse_json, plain
-from cnpgen.store.files.journal import append_line
+from cnpgen.store.files.documents import canonical_sha256, plain
+from cnpgen.store.files.record_file import RecordFile, RecordFormat, open_records
 from cnpgen.store.paths import require_file
 
-RESULTS_FORMAT = "cnpgen-benchmark"
-RESULTS_VERSION = 2
-_FORMAT = {"format": RESULTS_FORMAT, "format_version": RESULTS_VERSION}
 _POINTS = [Nullable(FINITE)]
 _PLAN = {
     "degree": WHOLE,
@@ -66,15 +63,14 @@ _VERDICT = {
 class Results:
     """Results of one planner: the file, and problem -> its row, see ``cnpgen docs benchmark``."""
 
-    path: Path
-    rows: dict[int, JsonObject] = field(default_factory=dict)
+    file: RecordFile
+    rows: dict[int, JsonObject]
 
     def append(self, row: JsonObject) -> None:
         """Append a line to the file and to the rows."""
-        text = json.dumps(row, allow_nan=False)
         # Equal to the row that a later run reads.
-        self._merge(json.loads(text))
-        append_line(self.path, text)
+        _merge(self.rows, json.loads(json.dumps(row, allow_nan=False)))
+        self.file.append(row)
 
     def missing(self, count: int) -> Iterator[int]:
         """Yield those of the first ``count`` problems without planning result."""
@@ -88,14 +84,6 @@ class Results:
             row = self.rows.get(index, {})
             if row.get("answer") is not None and plant not in row.get("executed", {}):
                 yield index
-
-    def _merge(self, row: JsonObject) -> None:
-        known = self.rows.setdefault(row["problem"], {})
-        # Executions of several plants add up; other keys of a row are replaced.
-        executed = {**known.get("executed", {}), **row.get("executed", {})}
-        known |= row
-        if executed:
-            known["executed"] = executed
 
 
 def open_results(
@@ -111,57 +99,37 @@ def open_results(
     run may be discarded.
 
     Raises:
-        UsageError: The file belongs to another run.
-        DatasetError: The file is damaged.
+        UsageError: The file belongs to another run, or is in use.
+        DatasetError: The file is damaged, or has another format.
         MachineError: The file cannot be read or written.
     """
-    head = json.dumps({**_FORMAT, **identity})
-    lines: list[str] = []
     if path.exists():
         require_file(path, "the results of a planner")
-        lines = _complete_lines(path)
-        if lines and lines[0] != head and not overwrite:
-            raise UsageError(
-                f"{path} holds results of another run ({_differences(lines[0], head)});"
-                " {force} overwrites them, another folder keeps them",
-                remedies={"force": True},
-            )
-        lines = lines[1:] if lines and lines[0] == head and not discard else []
-    results = _read_rows(path, lines)
-    # The file is rewritten without an incomplete last line.
-    write_file(path, "".join(f"{line}\n" for line in (head, *lines)).encode())
-    return results
+    file = open_records(path, RESULTS, identity, discard=overwrite)
+    if discard:
+        file.clear()
+    return Results(file, _merged(file.records))
 
 
-def _differences(line: str, head: str) -> str:
-    """Name the keys in which two heads differ."""
-    one = json.loads(line)
-    other = json.loads(head)
-    if not isinstance(one, dict):
-        return "it has no head"
-    # A digest says nothing to a reader; the other keys name the difference.
-    keys = [
-        key for key in other if one.get(key) != other[key] and key != "suite_sha256"
-    ]
-    return f"other {', '.join(keys) or 'problems'}".replace("_", " ")
+def _merged(records: Sequence[JsonObject]) -> dict[int, JsonObject]:
+    """Return problem -> its row."""
+    rows: dict[int, JsonObject] = {}
+    for row in records:
+        _merge(rows, row)
+    return rows
 
 
-def _read_rows(path: Path, lines: list[str]) -> Results:
-    results = Results(path)
-    for number, line in enumerate(lines, start=2):
-        row = json.loads(line)
-        try:
-            _check_row(row)
-        except ValueError as error:
-            raise DatasetError(
-                f"{path} is damaged: line {number}: {error}; delete that line"
-            ) from error
-        results._merge(row)
-    return results
+def _merge(rows: dict[int, JsonObject], row: JsonObject) -> None:
+    known = rows.setdefault(row["problem"], {})
+    # Executions of several plants add up; other keys of a row are replaced.
+    executed = {**known.get("executed", {}), **row.get("executed", {})}
+    known |= row
+    if executed:
+        known["executed"] = executed
 
 
-def _check_row(row: Any) -> None:
-    """Raise ``ValueError`` if a line is not a row of results.
+def _checked_row(row: Any) -> JsonObject:
+    """Return a row of results; raise ``ValueError`` if a line is none.
 
     Files are untrusted input.
     """
@@ -185,26 +153,24 @@ def _check_row(row: Any) -> None:
             check_structure(
                 executed, _present(dict.fromkeys(FIGURES, Nullable(FINITE)), executed)
             )
+    return dict(row)
+
+
+RESULTS = RecordFormat(
+    "cnpgen-benchmark",
+    2,
+    "a file of results of cnpgen",
+    "{force} overwrites its results, another folder keeps them",
+    "force",
+    _checked_row,
+    checked=False,
+)
 
 
 def _present(
     structures: dict[str, Structure], table: JsonObject
 ) -> dict[str, Structure]:
     return {name: structure for name, structure in structures.items() if name in table}
-
-
-def _complete_lines(path: Path) -> list[str]:
-    """Return the lines of a file up to the first line that is not JSON."""
-    complete = []
-    with machine_errors("read", path):
-        lines = path.read_bytes().decode("utf-8", "replace").splitlines()
-    for line in lines:
-        try:
-            parse_json(line)
-        except ValueError:
-            break
-        complete.append(line)
-    return complete
 
 
 def answer_to_dict(answer: Plans | Trajectory) -> JsonObject:
@@ -289,21 +255,23 @@ class ResultsFolder:
             "seed": setting.seed,
         }
 
-    def _results(self) -> Iterator[tuple[Path, JsonObject, Results | None]]:
-        """Yield path, head and results of every file.
+    def _results(
+        self,
+    ) -> Iterator[tuple[Path, JsonObject, dict[int, JsonObject] | None]]:
+        """Yield path, head and rows of every file.
 
-        None for results of another suite, version or time limit.
+        None for those of another suite, version or time limit.
         """
+        shared = RESULTS.head(self._shared)
         for path in sorted(self.path.glob("*.jsonl")):
             require_file(path, "the results of a planner")
-            lines = _complete_lines(path)
-            head = json.loads(lines[0]) if lines else None
-            if isinstance(head, dict) and head.get("format") == RESULTS_FORMAT:
-                is_own = all(
-                    head.get(key) == value
-                    for key, value in {**_FORMAT, **self._shared}.items()
-                )
-                yield path, head, _read_rows(path, lines[1:]) if is_own else None
+            head = None
+            with suppress(DatasetError):
+                head, records = RESULTS.read(path)
+            if head is not None:
+                is_own = head.items() >= shared.items()
+                rows = _merged(RESULTS.unpacked(path, records)) if is_own else None
+                yield path, head, rows
 
     def planners(self, *, delete_others: bool) -> set[str]:
         """Return the planners with results.
@@ -360,15 +328,17 @@ class ResultsFolder:
 
     def rows(self, first: Sequence[str]) -> dict[str, list[JsonObject]]:
         """Return planner -> rows of all results, the given planners first."""
-        parts: dict[str, dict[int, Results]] = {name: {} for name in first}
-        for _, head, results in self._results():
-            if results is not None:
-                parts.setdefault(head["planner"], {})[head["repetition"]] = results
+        parts: dict[str, dict[int, dict[int, JsonObject]]] = {
+            name: {} for name in first
+        }
+        for _, head, rows in self._results():
+            if rows is not None:
+                parts.setdefault(head["planner"], {})[head["repetition"]] = rows
         return {
             name: [
                 {**row, "repetition": repetition}
-                for repetition, results in sorted(repetitions.items())
-                for _, row in sorted(results.rows.items())
+                for repetition, rows in sorted(repetitions.items())
+                for _, row in sorted(rows.items())
                 if "ending" in row
             ]
             for name, repetitions in parts.items()

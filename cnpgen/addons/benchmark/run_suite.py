@@ -275,9 +275,10 @@ class _BenchmarkRun:
                 overwrite=self.overwrite,
                 discard=self.options.replan,
             )
-            self.plan(results, name, replace(setting, repetition=repetition))
-            for plant in self.plants:
-                self.execute(results, name, repetition, plant)
+            with closing(results.file):
+                self.plan(results, name, replace(setting, repetition=repetition))
+                for plant in self.plants:
+                    self.execute(results, name, repetition, plant)
 
     def collected(
         self, suite: Suite, planners: Sequence[str], runs: tuple[RunRecord, ...]

@@ -130,6 +130,14 @@ def write_file(path: Path, content: bytes | str, *, work: Path | None = None) ->
         temporary.write_bytes(content.encode() if isinstance(content, str) else content)
 
 
+def append_to_file(path: Path, content: bytes) -> None:
+    """Append to a file and flush it to the disk, or raise MachineError."""
+    with machine_errors("write", path), path.open("ab") as file:
+        file.write(content)
+        file.flush()
+        os.fsync(file.fileno())
+
+
 @contextmanager
 def _reading(path: Path) -> Iterator[None]:
     """Raise an error that names the file if it is missing or cannot be read."""

@@ -6,7 +6,7 @@ from pathlib import Path
 HDF5_SUFFIXES = (".h5", ".hdf5")
 HDF5 = b"\x89HDF\r\n\x1a\n"
 _CNPGEN_HEADER = re.compile(
-    rb"cnpgen[- ](plans|model|checkpoint|proposals|journal) [0-9]"
+    rb'(?:{"format": "cnpgen-|cnpgen[- ])(plans|model|checkpoint|proposals|journal)[" ]'
 )
 _SIGNATURES = {
     HDF5: "an HDF5 file",

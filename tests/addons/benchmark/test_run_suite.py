@@ -353,7 +353,7 @@ ANSWER = {"degree": 7, "path_control_points": [[0.0]], "rate_control_points": [1
     ],
 )
 def test_an_invalid_line_is_named(tmp_path: Path, row: Any, text: str) -> None:
-    open_results(tmp_path / "a.jsonl", {})
+    open_results(tmp_path / "a.jsonl", {}).file.close()
     with (tmp_path / "a.jsonl").open("a") as file:
         file.write(json.dumps(row) + "\n")
     with pytest.raises(
@@ -364,10 +364,12 @@ def test_an_invalid_line_is_named(tmp_path: Path, row: Any, text: str) -> None:
 
 
 def test_deeply_nested_lines_are_ignored_and_a_pipe_is_refused(tmp_path: Path) -> None:
-    open_results(tmp_path / "a.jsonl", {})
+    open_results(tmp_path / "a.jsonl", {}).file.close()
     with (tmp_path / "a.jsonl").open("a") as file:
         file.write("[" * 100_000 + "\n")
-    assert open_results(tmp_path / "a.jsonl", {}).rows == {}
+    results = open_results(tmp_path / "a.jsonl", {})
+    assert results.rows == {}
+    results.file.close()
     os.mkfifo(tmp_path / "b.jsonl")
     with is_refused(UsageError, argument="path"):
         open_results(tmp_path / "b.jsonl", {})
@@ -449,7 +451,9 @@ def test_answers_are_read_back_exactly(tmp_path: Path) -> None:
     results.append(
         {**PLANNED, "answer": answer_to_dict(trajectory), "verdict": verdict}
     )
+    results.file.close()
     reread = open_results(tmp_path / "a.jsonl", {})
+    reread.file.close()
     read = answer_from_dict(problem, reread.rows[0]["answer"])
     assert isinstance(read, Trajectory)
     assert (read.q == trajectory.q).all()
