@@ -597,6 +597,7 @@ def test_list_can_be_narrowed_and_read_by_programs(run):
         "objectives",
         "exporters",
         "families",
+        "shapes",
         "planners",
         "suites",
     ]

@@ -21,7 +21,11 @@ UNBOUNDED_OBSTACLE_HEIGHT_M = 10.0
 
 @dataclass(frozen=True, kw_only=True)
 class BoxShape(SizedShape):
-    """A box; its numbers are the position, half its edge lengths, and its rotation matrix if it is rotated."""
+    """A box.
+
+    Its numbers are the position, half its edge lengths, and its rotation matrix if it
+    is rotated.
+    """
 
     size: Vector3 = field("edge lengths", unit="m", low=1e-6)
 

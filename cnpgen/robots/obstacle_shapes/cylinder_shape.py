@@ -23,7 +23,10 @@ _UNIT_PRISM = np.array(
 
 @dataclass(frozen=True, kw_only=True)
 class CylinderShape(AxialShape):
-    """A cylinder; the radius among its numbers is that of the corners of the prism round it."""
+    """A cylinder.
+
+    The radius among its numbers is that of the corners of the prism round it.
+    """
 
     radius_share = math.cos(math.pi / PRISM_SIDES)
 

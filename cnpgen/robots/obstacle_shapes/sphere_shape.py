@@ -17,7 +17,10 @@ from cnpgen.schema.keys import field
 
 @dataclass(frozen=True, kw_only=True)
 class SphereShape(SizedShape):
-    """A sphere; its numbers are the position and the radius."""
+    """A sphere.
+
+    Its numbers are the position and the radius.
+    """
 
     radius: float = field("radius", unit="m", low=1e-6)
 
