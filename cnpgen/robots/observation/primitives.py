@@ -58,7 +58,7 @@ class ConvexMesh:
 
 @lru_cache(MAX_KEPT_MESHES)
 def convex_mesh(shape: ObstacleShape) -> ConvexMesh:
-    """Return the mesh of the surface of a shape; round edges have corners in directions 7.5 degrees apart."""
+    """Return the mesh of the surface of a shape; round edges have corners in ``BALL_DIRECTIONS``."""
     from scipy.spatial import ConvexHull
 
     core, radius = shape.polytope()

@@ -23,7 +23,7 @@ MIN_THICKNESS_M = 1e-6
 MAX_CORNERS = 10_000  # of a body; finer meshes take minutes without benefit
 # Of the body that replaces a finer one; it is about 0.1 % larger.
 ENCLOSING_PLANES = 2_000
-BALL = 12  # directions per quarter of a circle in which round bodies have corners
+BALL_DIRECTIONS = 1200  # in which round bodies have corners
 MAX_EDGES = 255  # at a corner of a body of Coal
 MAX_COORDINATE_M = 1e4  # larger coordinates are treated as errors of units
 
@@ -70,18 +70,8 @@ def inflated(corners: Array, radius: float) -> Array:
     """Return points whose hull is that of corners [m], shape (V, 3), inflated by a radius [m]: balls of corners."""
     if not radius:
         return corners
-    angles = np.linspace(0, np.pi, 2 * BALL + 1)
-    # Meridians include both poles; around the circle, the last turn would repeat the
-    # first.
-    turns = np.arange(4 * BALL) * np.pi / (2 * BALL)
-    level = np.sin(angles)[:, None]
-    height = np.broadcast_to(np.cos(angles)[:, None], (len(angles), len(turns)))
-    ball = np.unique(
-        np.stack(
-            [level * np.cos(turns), level * np.sin(turns), height], axis=-1
-        ).reshape(-1, 3),
-        axis=0,
-    )
+    half = half_sphere(BALL_DIRECTIONS // 2)
+    ball = np.concatenate([half, -half])
     points: Array = (corners[:, None] + radius * ball).reshape(-1, 3)
     return points
 
