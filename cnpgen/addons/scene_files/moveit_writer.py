@@ -59,11 +59,9 @@ def _shape(obstacle: Obstacle) -> list[str]:
             *vertices,
             "      mesh_poses:",
         ]
-    dimensions = {
-        "box": list(obstacle.size or ()),
-        "sphere": [obstacle.radius],
-        "cylinder": [obstacle.length, obstacle.radius],
-    }[obstacle.kind]
+    lengths = obstacle.form.lengths()
+    # The height of a cylinder is before its radius.
+    dimensions = lengths if obstacle.kind == "box" else lengths[::-1]
     lines = [
         "      primitives:",
         f"        - type: {obstacle.kind}",

@@ -29,6 +29,7 @@ from cnpgen.problems.scenes.scene_problem import (
 )
 from cnpgen.problems.scenes.scene_request import SceneRequest
 from cnpgen.robots.obstacle import Obstacle
+from cnpgen.robots.obstacle_shapes.obstacle_shape import shape_class
 from cnpgen.robots.shape.convex_part import turned
 from cnpgen.store.files.accounted import Account, UnusedElements, accounted
 from cnpgen.store.files.hdf5 import Hdf5, create_hdf5, open_hdf5
@@ -39,12 +40,11 @@ UNUSED_ELEMENTS = UnusedElements(
     harmless={},
     unused=dict.fromkeys(_TRAJECTORIES, "trajectories beside starts and goals"),
 )
-# Kind -> datasets of its sizes, their number of columns, the word in the names of the
-# others.
+# Kind -> the word in the names of its datasets, and those of its dimensions.
 _SHAPES = {
-    "box": (("cuboid_dims",), (3,), "cuboid"),
-    "cylinder": (("cylinder_radii", "cylinder_heights"), (1, 1), "cylinder"),
-    "sphere": (("sphere_radii",), (1,), "sphere"),
+    "box": ("cuboid", "cuboid_dims"),
+    "cylinder": ("cylinder", "cylinder_radii", "cylinder_heights"),
+    "sphere": ("sphere", "sphere_radii"),
 }
 SCENE_NAMES = "scene_names"  # attribute: a line of text per scene
 
@@ -75,9 +75,7 @@ def read_mpinets(
         place = f"{path}: scene {name!r}"
         numbers = {kind: values[row] for kind, values in shapes.items()}
         check_count(
-            sum(
-                int(_is_present(kind, values).sum()) for kind, values in numbers.items()
-            ),
+            sum(int(_is_present(values).sum()) for values in numbers.values()),
             place,
         )
         scene = SceneProblem(
@@ -97,7 +95,7 @@ def _check_names(file: Hdf5, account: Account) -> None:
     ends = next((both for both in _ENDS if all(name in file for name in both)), ())
     trajectory = next((name for name in _TRAJECTORIES if name in file), "")
     used = [*ends] if ends else [trajectory]
-    for sizes, _, word in _SHAPES.values():
+    for word, *sizes in _SHAPES.values():
         used += [*sizes, f"{word}_centers", _quaternions(file, word)]
     names: dict[str, Any] = dict.fromkeys((*file.names(), *file.attributes))
     # Attributes of datasets, such as a unit or a scale, may change their numbers.
@@ -163,7 +161,8 @@ def _check_rows(file: Hdf5, name: str, rows: slice) -> None:
 
 def _entries(file: Hdf5, kind: str, rows: slice, count: int) -> Array:
     """Return sizes, centers and quaternions of the obstacles of a kind, shape (N, M, sizes + 7)."""
-    names, widths, word = _SHAPES[kind]
+    word, *names = _SHAPES[kind]
+    widths = shape_class(kind).sizes().values()
     # A part of the datasets of a kind is an error: it is not a file without the kind.
     parts = (*names, f"{word}_centers", _quaternions(file, word))
     if not any(name in file for name in parts):
@@ -220,19 +219,19 @@ def _names(file: Hdf5, rows: slice, count: int) -> list[str]:
     return names
 
 
-def _is_present(kind: str, values: Array) -> Mask:
+def _is_present(values: Array) -> Mask:
     """Return which entries are obstacles: those without a size of zero."""
     # Nan counts as a size.
-    return np.asarray((values[:, : sum(_SHAPES[kind][1])] != 0).all(axis=1))
+    # Seven numbers of the pose follow.
+    return np.asarray((values[:, :-7] != 0).all(axis=1))
 
 
 def _obstacles(numbers: dict[str, Array], place: str) -> Iterator[Obstacle]:
     for kind, values in numbers.items():
-        width = sum(_SHAPES[kind][1])
-        for index in np.flatnonzero(_is_present(kind, values)).tolist():
-            sizes, center, quaternion = np.split(values[index], [width, width + 3])
+        for index in np.flatnonzero(_is_present(values)).tolist():
+            sizes, center, quaternion = np.split(values[index], [-7, -4])
             yield make_obstacle(
-                f"{_SHAPES[kind][2]} {index}",
+                f"{_SHAPES[kind][0]} {index}",
                 kind,
                 sizes,
                 center,
@@ -280,21 +279,18 @@ def mpinets_bytes(scenes: Sequence[SceneProblem]) -> bytes:
 
 def _padded(kind: str, obstacles: list[list[Obstacle]]) -> dict[str, Array]:
     """Return the datasets of a kind, padded with zeros."""
-    names, widths, word = _SHAPES[kind]
+    word, *names = _SHAPES[kind]
+    widths = shape_class(kind).sizes().values()
     most = max(map(len, obstacles), default=0)
     # Files of others have no spheres, so an empty dataset is left out.
     if kind == "sphere" and not most:
         return {}
     count = len(obstacles)
-    width = sum(widths)
-    values = np.zeros((count, most, width + 7))
+    values = np.zeros((count, most, sum(widths) + 7))
     for row, items in enumerate(obstacles):
         for index, item in enumerate(items):
-            sizes = (
-                item.size if kind == "box" else (item.radius, item.length)[: len(names)]
-            )
             values[row, index] = [
-                *(sizes or ()),
+                *item.form.lengths(),
                 *(item.position or ()),
                 *quaternion_of(turned(*item.rotation)),
             ]

@@ -58,6 +58,11 @@ class ObstacleShape(ABC):
             return dict.fromkeys(counts, tuple(sizes))
         return dict(zip(counts, sizes, strict=False))
 
+    def lengths(self) -> list[float]:
+        """Return the lengths of all dimensions in turn [m], such as files of scenes have."""
+        values = [np.ravel(getattr(self, name)) for name in self.sizes()]
+        return [float(length) for length in np.concatenate(values)]
+
     @classmethod
     def numbers(cls, position: Array, size: Array, rotation: Array) -> Array:  # noqa: ARG003
         """Return the numbers of M rotated obstacles, shape (M, width).
