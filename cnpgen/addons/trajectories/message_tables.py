@@ -324,7 +324,7 @@ def _seconds(stamp: Any, where: str) -> Fraction:
         and not isinstance(part, bool)
         and math.isfinite(part)
         for part in parts
-    ):
+    ) and not (isinstance(stamp, dict) and stamp.get("nanosec", 0) < 0):  # unsigned
         return Fraction(parts[0]) + Fraction(parts[1]) / 10**9
     raise UsageError(
         f"{where} must be a time such as {{sec, nanosec}}, got {stamp!r:.60}"

@@ -40,6 +40,11 @@ UNUSED_KINDS = ("jerk", "effort", "efforts")  # not reported as ignored
 MAX_EXACT_START_S = 1e6  # later times of the first sample lose digits in float64
 MAX_HELD_DIFFERENCE = 1e-9  # rad or m, of joints that are not planned
 MAX_LISTED = 12  # columns in messages
+# Whether the first time is positive -> note.
+_FIRST_TIMES = {
+    True: "the motion before its first sample is not known",
+    False: "controllers skip the samples before 0, which count as part of the motion here",
+}
 
 
 @dataclass
@@ -88,11 +93,12 @@ class TableReader:
         if self.options.unwrap:
             turning = [not sliding for sliding in self.record.prismatic_joints]
             rows["q"][:, turning] = np.unwrap(rows["q"][:, turning], axis=0)
-        if rows["t"][0] > 0 and self.options.separate_by is None:
+        first = rows["t"][0]
+        if first != 0 and self.options.separate_by is None:
             self.notes.append(
-                f"{self.table.place} begins at t = {rows['t'][0]:.6g} s: the motion before its first sample is not known"
+                f"{self.table.place} begins at t = {first:.6g} s: {_FIRST_TIMES[bool(first > 0)]}"
             )
-        rows["t"] = rows["t"] - rows["t"][0]
+        rows["t"] = rows["t"] - first
         return self._checked(rows)
 
     def _checked(self, rows: dict[str, Any]) -> Trajectory:

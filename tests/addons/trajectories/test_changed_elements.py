@@ -186,6 +186,61 @@ def test_elements_of_messages(
     assert outcome(*paths) == expected
 
 
+def at(index: int, seconds: int, nanoseconds: int = 0) -> Callable[[Any], None]:
+    """Return a change of the time of one point, or with index -1 a shift of all."""
+
+    def change(message: Any) -> None:
+        stamps = [point["time_from_start"] for point in message["points"]]
+        if index >= 0:
+            stamps[index].update(sec=seconds, nanosec=nanoseconds)
+            return
+        for stamp in stamps:
+            stamp["sec"] += seconds
+
+    return change
+
+
+@pytest.mark.parametrize(
+    ("change", "expected"),
+    [
+        (at(-1, -100), "begins at t = -100 s: controllers skip"),
+        (at(0, -1), "begins at t = -1 s: controllers skip"),
+        (at(-1, 2), "begins at t = 2 s: the motion before"),
+        (at(3, -1), "must increase"),
+        (at(3, 0, round(1e9 * T[2])), "must increase"),
+        (at(3, 0, -5), "must be a time such as"),
+        (at(0, 0, -5), "must be a time such as"),
+    ],
+)
+def test_times_before_the_start(
+    tmp_path: Path, change: Callable[[Any], None], expected: str
+) -> None:
+    message = copy.deepcopy(MESSAGE)
+    change(message)
+    wrapped = {"planned_trajectory": {"joint_trajectory": message}}
+    for document in (message, {"goal": {"trajectory": message}}, wrapped):
+        path = tmp_path / "a.json"
+        path.write_text(json.dumps(document))
+        if expected.startswith("begins"):
+            notes = load_trajectories(path, "airhockey").notes
+            assert any(expected in note for note in notes)
+        else:
+            with pytest.raises(UsageError, match=expected):
+                load_trajectories(path, "airhockey")
+
+
+@pytest.mark.parametrize("suffix", ["npz", "hdf5"])
+def test_times_of_arrays_before_the_start(tmp_path: Path, suffix: str) -> None:
+    path = tmp_path / f"a.{suffix}"
+    if suffix == "npz":
+        np.savez(path, t=T - 1, q=Q)
+    else:
+        with h5py.File(path, "w") as file:
+            file["t"], file["q"] = T - 1, Q
+    notes = load_trajectories(path, "airhockey").notes
+    assert any("begins at t = -1 s: controllers skip" in note for note in notes)
+
+
 def test_the_loss_of_an_element_is_accepted_by_name(tmp_path: Path) -> None:
     path = tmp_path / "a.json"
     path.write_text(json.dumps(MESSAGE | {"velocity_scaling": 0.5}))

@@ -231,15 +231,21 @@ def test_repeated_rows_are_dropped_on_request(tmp_path: Path) -> None:
         loaded(path, drop_repeats=True)
 
 
-def test_a_first_sample_after_the_start_is_noted(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+@pytest.mark.parametrize(
+    ("shift", "note"),
+    [
+        (0.5, "begins at t = 0.5 s: the motion before its first sample is not known"),
+        (-0.5, "begins at t = -0.5 s: controllers skip the samples before 0"),
+        (-9.0, "begins at t = -9 s: controllers skip the samples before 0"),
+    ],
+)
+def test_a_first_sample_that_is_not_at_the_start_is_noted(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], shift: float, note: str
 ) -> None:
-    path = table(tmp_path / "a.csv", ["t", *NAMES], T + 0.5, Q)
+    path = table(tmp_path / "a.csv", ["t", *NAMES], T + shift, Q)
     main(["evaluate", str(path), "--problem", "airhockey"])
     text = capsys.readouterr().err
-    assert (
-        "begins at t = 0.5 s: the motion before its first sample is not known" in text
-    )
+    assert note in text
     assert "columns without a unit are read in s, rad and m" in text
 
 
