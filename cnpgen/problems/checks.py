@@ -252,6 +252,9 @@ def _shape_errors(
     meshes = dict.fromkeys(
         mesh.get("filename", "") for each in elements for mesh in each.iter("mesh")
     )
+    if robot.get("convex_parts", 1) != 1 and not (meshes or robot.get("visual_links")):
+        text = "no <collision> element of the URDF has a mesh to divide"
+        yield (where / "convex_parts").message(text)
     # Inline meshes (data:) are in the text itself and need no file.
     for name in (each for each in meshes if not each.startswith("data:")):
         try:

@@ -111,18 +111,7 @@ def read_problem(path: Path, errors: list[str]) -> Problem | None:
     if problem is None or len(errors) > before:
         return None
     errors.extend(limit_errors(problem, raw))
-    is_stated = "urdf_dynamics" in table.get("drive", {})
-    if raw.urdf is not None and problem.first(JointTorque) and not is_stated:
-        undecided = undecided_friction(raw.urdf, problem.robot.joints)
-        if undecided and problem.version > 1:
-            errors.append(f"{path}: drive.urdf_dynamics: missing; {undecided}")
-        # Files of version 1 ignored friction silently: an error would reject them.
-        elif undecided:
-            warnings.warn(
-                f"{path}: friction of the URDF is ignored; {undecided}",
-                UserWarning,
-                stacklevel=3,
-            )
+    errors.extend(_friction_errors(problem, raw, path))
     read = replace(
         problem,
         path=path.absolute(),
@@ -130,9 +119,36 @@ def read_problem(path: Path, errors: list[str]) -> Problem | None:
         obstacle=obstacles,
         constraint=raw.with_object_clearance(problem),
     )
-    if text := idle_text(idle_keys(read)):
+    for text in filter(None, [idle_text(idle_keys(read)), *_tolerance_notes(read)]):
         _LOG.warning("%s: %s", path, text)
     return read
+
+
+def _tolerance_notes(problem: Problem) -> Iterator[str]:
+    """Yield notes on tolerances that would permit penetration."""
+    for index, each in enumerate(problem.constraint, 1):
+        if each.effective_tolerance < each.tolerance:
+            text = f"{each.effective_tolerance:g} m of the tolerance of {each.tolerance:g} m"
+            yield f"constraint {index}: only {text} count, so that bodies do not overlap"
+
+
+def _friction_errors(problem: Problem, raw: ProblemTables, path: Path) -> Iterator[str]:
+    """Yield errors about friction of the URDF that is not decided on, or that is to be used and not there."""
+    drive = problem.drive
+    if raw.urdf is None or problem.first(JointTorque) is None:
+        return
+    undecided = undecided_friction(raw.urdf, problem.robot.joints)
+    if "urdf_dynamics" in raw.table.get("drive", {}):
+        if drive.urdf_dynamics == "use" and not undecided:
+            yield f"{path}: drive.urdf_dynamics: the URDF has no friction to use"
+        elif drive.urdf_dynamics == "use" and drive.viscous and drive.coulomb:
+            yield f"{path}: drive.urdf_dynamics: 'viscous' and 'coulomb' replace the URDF's friction"
+    elif undecided and problem.version > 1:
+        yield f"{path}: drive.urdf_dynamics: missing; {undecided}"
+    # Files of version 1 ignored friction silently: an error would reject them.
+    elif undecided:
+        text = f"{path}: friction of the URDF is ignored; {undecided}"
+        warnings.warn(text, UserWarning, stacklevel=4)
 
 
 def _with_meshes(

@@ -164,25 +164,36 @@ def with_collision_geometry(
     if not visual and not skipped:
         return urdf
     robot = urdf_tree(urdf)
-    errors = list[str]()
     links = {link.get("name", ""): link for link in robot.findall("link")}
-    for key, names in {"visual_links": visual, "skipped_meshes": skipped}.items():
-        errors += [
-            f"robot.{key}: the URDF has no link {name!r}{nearest(name, links)}"
-            for name in names
-            if name not in links
-        ]
+    errors = list[str]()
+    for name in visual:
+        error = _link_error(links, name, "visual", none_of="collision")
+        errors += [f"robot.visual_links: {error}"] if error else []
+    for name in skipped:
+        error = _link_error(links, name, "collision/geometry/mesh")
+        errors += [f"robot.skipped_meshes: {error}"] if error else []
     if errors:
         raise RecipeError(errors)
     for name in visual:
-        link = links[name]
-        if link.find("collision") is None:
-            link.extend(_as_collision(each) for each in link.findall("visual"))
+        links[name].extend(map(_as_collision, links[name].findall("visual")))
     for name in skipped:
         for element in links[name].findall("collision"):
             if element.find("geometry/mesh") is not None:
                 links[name].remove(element)
     return ElementTree.tostring(robot, encoding="unicode")
+
+
+def _link_error(
+    links: Mapping[str, Element], name: str, element: str, none_of: str = ""
+) -> str:
+    """Return an error message for a link without an element, or with another one; empty if there is none."""
+    if name not in links:
+        return f"the URDF has no link {name!r}{nearest(name, links)}"
+    if links[name].find(element) is None:
+        return f"the link {name!r} has no {element}"
+    if none_of and links[name].find(none_of) is not None:
+        return f"the link {name!r} has <{none_of}> elements, which count"
+    return ""
 
 
 def _as_collision(visual: Element) -> Element:

@@ -166,6 +166,7 @@ def test_a_key_is_named_if_and_only_if_it_changes_no_condition(
         (
             "object-clearance",
             {
+                "robot.geometry",
                 "robot.srdf",
                 "robot.ignored_pairs",
                 "payload.size",
@@ -175,6 +176,7 @@ def test_a_key_is_named_if_and_only_if_it_changes_no_condition(
         (
             "object-contact",
             {
+                "robot.geometry",
                 "robot.srdf",
                 "robot.ignored_pairs",
                 "robot.convex_parts",

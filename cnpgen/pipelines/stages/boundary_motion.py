@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from cnpgen.documents import NamedErrors
 from cnpgen.kernels.symbolic.drive import motor_torque
 from cnpgen.kernels.symbolic.dynamics import inverse_dynamics
 from cnpgen.kernels.symbolic.kinematics import (
@@ -69,6 +70,11 @@ class AtRest(Stage):
         default="free",
         since_version=2,
     )
+
+    def validate(self) -> NamedErrors:
+        """Yield (key, error) pairs."""
+        if self.end == "start" and self.acceleration == "zero":
+            yield "acceleration", "motions always start with zero: omit it"
 
     def describe(self) -> str:
         if self.end == "goal" and self.acceleration == "free":

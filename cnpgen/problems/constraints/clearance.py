@@ -27,6 +27,8 @@ LINK_KEYS = (
     "robot.visual_links",
     "robot.skipped_meshes",
 )
+# Those of the shape of the robot, with its payload.
+ROBOT_KEYS = ("robot.geometry", *LINK_KEYS, "payload.touch_links")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -79,7 +81,7 @@ class RobotClearance(DistanceConstraint):
 
     reason = "robot in collision"
     condition_name = "robot clearance"
-    reads = (*LINK_KEYS, "payload.touch_links")
+    reads = ROBOT_KEYS
     bodies = "robot"
     training_weight = 3000.0
     radius: float | None = field(

@@ -10,6 +10,7 @@ from cnpgen.arrays import Array, Mask
 from cnpgen.problems.constraints.clearance import (
     LINK_KEYS,
     MAX_LINK_PENETRATION_M,
+    ROBOT_KEYS,
     DistanceConstraint,
 )
 from cnpgen.problems.constraints.constraint import Conditions, End
@@ -57,7 +58,7 @@ class SelfClearance(LinkClearance):
 
     reason = "robot in collision with itself"
     condition_name = "self clearance"
-    reads = (*LINK_KEYS, "robot.srdf", "robot.ignored_pairs", "payload.touch_links")
+    reads = (*ROBOT_KEYS, "robot.srdf", "robot.ignored_pairs")
     bodies = "self"
     distance: float = field(
         "minimum distance of links", unit="m", low=0.0, default=0.0, plausible=2.0
