@@ -293,7 +293,7 @@ class Reader:
             document = changed(document, place, value)
         return self.read(json.dumps(document))
 
-    def fate(self, place: Place, default: Any, changes: Mapping[Place, Any]) -> str:
+    def outcome(self, place: Place, default: Any, changes: Mapping[Place, Any]) -> str:
         """Return what becomes of one of the changes: refused, used, listed, named, equal or lost."""
         others = {key: value for key, value in changes.items() if key != place}
         before, after = self.result(others), self.result(changes)
@@ -350,14 +350,14 @@ def test_every_key_is_used_refused_or_listed(
     document = document_of(kind, root)
     reader = Reader(tmp_path, document, kind)
     assert not reader.result({}).error
-    fates = Counter[str]()
+    outcomes = Counter[str]()
     lost = []
     for place, key, value in changes_of(kind, document):
-        fate = reader.fate(place, key.default, {place: value})
-        fates[fate] += 1
-        lost += [f"{place} = {value!r}"] if fate == "lost" else []
+        outcome = reader.outcome(place, key.default, {place: value})
+        outcomes[outcome] += 1
+        lost += [f"{place} = {value!r}"] if outcome == "lost" else []
     assert not lost
-    assert min(fates["refused"], fates["used"]) > 15
+    assert min(outcomes["refused"], outcomes["used"]) > 15
 
 
 def pairs_of(
@@ -383,14 +383,14 @@ def test_one_of_two_changes_does_not_hide_the_other(
     every = changes_of(kind, document)
     # Most values that are refused alone are refused together: one value of ten.
     valid = [each for each in every if not reader.result({each[0]: each[2]}).error]
-    fates = Counter[str]()
+    outcomes = Counter[str]()
     lost = []
     pool = [*valid * (9 * len(every) // len(valid)), *every]
     for pair in pairs_of(pool, count, seed=4):
         changes = {place: value for place, _, value in pair}
         for place, key, _ in pair:
-            fate = reader.fate(place, key.default, changes)
-            fates[fate] += 1
-            lost += [f"{place} of {changes}"] if fate == "lost" else []
+            outcome = reader.outcome(place, key.default, changes)
+            outcomes[outcome] += 1
+            lost += [f"{place} of {changes}"] if outcome == "lost" else []
     assert not lost
-    assert min(fates["refused"], fates["used"]) > 15
+    assert min(outcomes["refused"], outcomes["used"]) > 15
