@@ -6,9 +6,9 @@ No attempt follows if an end is invalid itself (``cnpgen.refine.strategy``): no 
 2. Coarse level from the input plan or a straight line, uniform time scaling, fine level, strict level.
 3. Other initial guesses, and the best attempt so far after uniform time scaling.
 4. Step 2 again, from a straight line at constant rate, then from the best attempt so far.
-5. Without a deadline: levels on hulls in place of capsules, and joint-space paths of RRT-Connect. If compiled trees can
-   search these paths, they come right after step 2, whose finer levels run only for
-   nearly valid attempts. Without a path there are no further attempts.
+5. Without a deadline: levels on hulls in place of capsules, and joint-space paths of RRT-Connect. If the solver measures
+   hulls, these paths come right after step 2, whose finer levels run only for nearly
+   valid attempts. Without a path there are no further attempts.
 """
 
 from collections.abc import Generator, Iterator
@@ -20,7 +20,6 @@ from cnpgen.arrays import Array
 from cnpgen.kernels.collision.collision_checker import MAX_JOINTS
 from cnpgen.refine.grid_levels import MAX_INITIAL_VIOLATION
 from cnpgen.refine.refiner import Refiner
-from cnpgen.refine.solver.hulls import has_clearance_constraints
 from cnpgen.refine.solver.sqp import Result
 from cnpgen.refine.task import MAX_JUDGED_VIOLATION, Attempt, Outcome, RefinementTask
 from cnpgen.trajectory.remaining_trajectory import with_fewer_knots, with_finer_knots
@@ -61,7 +60,7 @@ def _all_attempts(
     adjusted = None
     if x is not None and task.at_rest:
         adjusted = refiner.measured(task, x, Outcome.ADJUSTED)
-    # Compiled trees find a path in milliseconds; without them, paths are the last resort.
+    # Trees that check hulls only take milliseconds; other paths are the last resort.
     searches_trees = refiner.measures_hulls and task.deadline is None
     # From a line deep inside an obstacle the coarse level cannot find a way around it.
     if searches_trees and x is None and _is_deep(refiner, task):
@@ -81,7 +80,7 @@ def _all_attempts(
     best = yield from _from_even_line(refiner, task, x, best)
     if searches_trees or task.deadline is not None:
         return
-    if has_clearance_constraints(refiner.problem, refiner.robot):
+    if refiner.has_hulls:
         yield from around_obstacles(refiner, task, best)
     elif task.at_rest and refiner.robot.n <= MAX_JOINTS:
         for guess in path_guesses(refiner, task):

@@ -76,10 +76,10 @@ class Refiner:
     """Solver of one problem, and the checks and initial guesses for it.
 
     If it ``measures_hulls``, distances of the links' hulls replace those of capsules in
-    all levels, see ``cnpgen.refine.solver.hull_levels``. By default kernels have the
-    fastest backend of this machine, and control points are those of the problem.
-    ``coarser`` is a refiner with these, for plans with several spans for each of its
-    spans.
+    all levels, see ``cnpgen.refine.solver.hull_levels``; if it ``has_hulls``, at least
+    in paths. By default kernels have the fastest backend of this machine, and control
+    points are those of the problem. ``coarser`` is a refiner with these, for plans with
+    several spans for each of its spans.
     """
 
     def __init__(
@@ -106,9 +106,9 @@ class Refiner:
         # The hulls of each thread.
         self._hulls = dict[int, Hulls]()
         self.measures_hulls = can_measure_hulls(problem, robot, self._world)
-        # Hulls decide where a robot has link geometry, in rows of the solver or in
-        # paths.
-        self._has_hulls = has_clearance_constraints(problem, robot)
+        self.has_hulls = self.measures_hulls or has_clearance_constraints(
+            problem, robot
+        )
         solved = problem
         if self.measures_hulls:
             # Distances become rows of the compiled hulls: the symbolic kernels do not
@@ -118,8 +118,6 @@ class Refiner:
                 solved, robot, kernels.backend, kernels.cache_folder
             )
         self._kernels = kernels
-        others = pose_width(problem.obstacle) - pose_width(solved.obstacle)
-        self._kernel_poses = slice(others, None)
         cost_term = choose_cost_term(problem, options.objective, options.weight)
         self.residual_kernels = _residual_kernels(self.spec, kernels, robot, cost_term)
         self._prepare_check(solved)
@@ -127,6 +125,8 @@ class Refiner:
 
     def _prepare_check(self, solved: Problem) -> None:
         """Prepare the check on the fine grid, by the kernels of the problem that is solved."""
+        others = pose_width(self.problem.obstacle) - pose_width(solved.obstacle)
+        self._kernel_poses = slice(others, None)
         self.check = FineCheck(
             solved,
             self._world,
@@ -474,7 +474,7 @@ class Refiner:
         self, task: RefinementTask, goals: Array | None = None
     ) -> TreeSearch:
         """Return the search for joint-space paths of a task, to any of several goals if there are, shape (G, n)."""
-        hulls = self.hulls if self.measures_hulls or self._has_hulls else None
+        hulls = self.hulls if self.has_hulls else None
         return TreeSearch(
             task,
             self.robot,

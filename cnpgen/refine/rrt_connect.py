@@ -178,21 +178,6 @@ class TreeSearch:
     ) -> Array | None:
         """Return the path of one pair of trees, or None."""
         hulls = self.hulls
-        settings = TreeSettings(
-            None if hulls is None else hulls.obstacle_distance,
-            None if hulls is None else hulls.self_distance,
-            margin=margin,
-            extension=length,
-            max_extensions=extensions,
-            shortcuts=TREE_SHORTCUTS,
-        )
-        if self.manifold is not None:
-            nodes = (
-                MANIFOLD_LARGE_TREE_NODES
-                if extensions == LARGE_TREE_EXTENSIONS
-                else MANIFOLD_NODES
-            )
-            settings = replace(settings, spacing=MANIFOLD_SPACING_RAD, max_nodes=nodes)
         task = self.task
         robot = self.robot
         start = task.boundary.start_q[0]
@@ -213,8 +198,28 @@ class TreeSearch:
             (start, goals),
             box,
             robot.velocity_limit,
-            settings,
+            self._settings(extensions, length, margin),
             seed=seed,
             manifold=self.manifold,
             at_rest=None if self.hulls_only else self.at_rest,
         )
+
+    def _settings(self, extensions: int, length: float, margin: float) -> TreeSettings:
+        """Return the settings of one pair of trees."""
+        hulls = self.hulls
+        settings = TreeSettings(
+            None if hulls is None else hulls.obstacle_distance,
+            None if hulls is None else hulls.self_distance,
+            margin=margin,
+            extension=length,
+            max_extensions=extensions,
+            shortcuts=TREE_SHORTCUTS,
+        )
+        if self.manifold is None:
+            return settings
+        nodes = (
+            MANIFOLD_LARGE_TREE_NODES
+            if extensions == LARGE_TREE_EXTENSIONS
+            else MANIFOLD_NODES
+        )
+        return replace(settings, spacing=MANIFOLD_SPACING_RAD, max_nodes=nodes)
