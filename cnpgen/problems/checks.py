@@ -190,12 +190,7 @@ def _robot_errors(raw: ProblemTables) -> Iterator[str]:
 
     Pinocchio checks the rest.
     """
-    joints = raw.robot.get("joints")
-    tip = raw.robot.get("tip")
-    locked = raw.robot.get("locked_joints")
     where = raw.where / "robot"
-    planned: list[Any] = joints if isinstance(joints, list) else []
-    placed = [*planned, *(locked if isinstance(locked, list) else [])]
     path = raw.urdf_path
     if path is None:
         return
@@ -214,19 +209,32 @@ def _robot_errors(raw: ProblemTables) -> Iterator[str]:
     if text := unread_xacro(raw.urdf, path):
         yield (where / "urdf").message(text)
         return
+    yield from _joint_errors(raw, raw.urdf, path)
+
+
+def _joint_errors(
+    raw: ProblemTables, urdf: ElementTree.Element, path: Path
+) -> Iterator[str]:
+    """Check that the URDF has the joints and the tip, and the places of the other joints."""
+    joints = raw.robot.get("joints")
+    tip = raw.robot.get("tip")
+    locked = raw.robot.get("locked_joints")
+    where = raw.where / "robot"
+    planned: list[Any] = joints if isinstance(joints, list) else []
+    placed = [*planned, *(locked if isinstance(locked, list) else [])]
     # A joint without a type counts as fixed.
     moving = [
         joint.get("name", "")
-        for joint in raw.urdf.iter("joint")
+        for joint in urdf.iter("joint")
         if joint.get("type", "fixed") != "fixed"
     ]
     for name in planned:
         if isinstance(name, str) and name not in moving:
             text = f"no joint {name!r} that moves{nearest(name, moving)}"
             yield (where / "joints").message(f"{path.name} has {text}")
-    if isinstance(tip, str) and (text := missing_frame(raw.urdf, path, tip)):
+    if isinstance(tip, str) and (text := missing_frame(urdf, path, tip)):
         yield (where / "tip").message(text)
-    for name, low, high in _outside_at_zero(raw.urdf.iter("joint"), placed):
+    for name, low, high in _outside_at_zero(urdf.iter("joint"), placed):
         text = f"{name!r} is not planned and stays at zero, which is outside of its limits [{low:g}, {high:g}]"
         yield (where / "joints").message(text)
 

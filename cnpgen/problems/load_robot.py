@@ -52,9 +52,8 @@ def load_robot(problem: Problem) -> Robot:
     """
     spec, limits = problem.robot, problem.limits
     with recipe_errors_in(problem.path):
-        urdf = problem.urdf_text
-        attached = _attached(problem)
-        model, joints = read_model(problem.urdf_path, urdf, spec.joints, attached)
+        path, urdf, attached = problem.urdf_path, problem.urdf_text, _attached(problem)
+        model, joints = read_model(path, urdf, spec.joints, attached)
         chain = chain_from_model(model, attached.tip)
         rated = _given(limits.velocity, "velocity", model.velocityLimit)
         torque = _given(limits.torque, "torque", model.effortLimit)
@@ -66,7 +65,7 @@ def load_robot(problem: Problem) -> Robot:
     # Ranges are scaled about their center c: c +- scale * (upper - lower) / 2.
     center, half = (upper + lower) / 2, limits.position_scale * (upper - lower) / 2
     robot = Robot(
-        urdf=problem.urdf_path,
+        urdf=path,
         urdf_text=urdf,
         joint_names=tuple(spec.joints),
         tip=attached.tip,
