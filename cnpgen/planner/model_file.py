@@ -40,6 +40,7 @@ from cnpgen.store.files.document_structure import (
     TEXT,
     WHOLE,
     check_structure,
+    structure_of,
 )
 from cnpgen.store.files.documents import parse_json
 from cnpgen.store.files.kind import kind_name
@@ -50,7 +51,7 @@ MAX_PROJECTION_STEPS = 20  # Gauss-Newton steps; each makes a kernel larger
 # Values that files omit.
 _DEFAULTS = {field.name: field.default for field in fields(ModelConfig)}
 _STRUCTURE = {
-    "architecture": {field.name: WHOLE for field in fields(Architecture)},
+    "architecture": structure_of(Architecture),
     "features": [TEXT],
     "config": {
         "path_scale": NUMBER,

@@ -20,12 +20,10 @@ from cnpgen.store.files.atomic import read_file
 from cnpgen.store.files.document_structure import (
     ANY_KEY,
     ANYTHING,
-    NUMBER,
     TEXT,
-    WHOLE,
-    Nullable,
     Structure,
     check_structure,
+    structure_of,
 )
 from cnpgen.store.files.documents import (
     canonical_sha256,
@@ -54,36 +52,6 @@ SPECIFICATION_FORMAT = "cnpgen-specification"
 # samples.
 GENERATOR_REVISION = 2
 SPECIFICATION_VERSION = 3
-_FIELD_STRUCTURE = {
-    **dict.fromkeys(("name", "unit", "long_name", "role", "frame", "dtype"), TEXT),
-    "width": WHOLE,
-    "names": [TEXT],
-    "valid_min": Nullable([NUMBER]),
-    "valid_max": Nullable([NUMBER]),
-}
-SPECIFICATION_STRUCTURE = {
-    **dict.fromkeys(
-        (
-            "name",
-            "version",
-            "title",
-            "license",
-            "recipe_sha256",
-            "dtype",
-            "backend",
-            "generator",
-        ),
-        TEXT,
-    ),
-    **dict.fromkeys(("fingerprint", "seed"), TEXT),
-    **dict.fromkeys(("shard_size", "block_rows", "revision"), WHOLE),
-    "recipe": {ANY_KEY: ANYTHING},
-    "splits": {ANY_KEY: WHOLE},
-    "fields": [_FIELD_STRUCTURE],
-    "previous_splits": [{ANY_KEY: WHOLE}],
-    "robot": {ANY_KEY: ANYTHING},
-    "versions": {ANY_KEY: TEXT},
-}
 # Keys that may differ between equal specifications. The key recipe_sha256 may not.
 INFORMATIONAL = ("title", "license", "versions", "recipe")
 _SCENE_KEYS = ("scene_obstacles", "scene_families")  # of datasets with scenes only
@@ -309,6 +277,13 @@ class DatasetSpec:
                 concerns="fields",
             )
         return by_name[name]
+
+
+SPECIFICATION_STRUCTURE = {
+    name: structure
+    for name, structure in structure_of(DatasetSpec).items()
+    if name not in _SCENE_KEYS
+} | {"seed": TEXT, "fingerprint": TEXT}
 
 
 def _check_sizes(spec: DatasetSpec) -> None:

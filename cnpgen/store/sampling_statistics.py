@@ -12,7 +12,7 @@ import numpy as np
 from cnpgen.arrays import Integers
 from cnpgen.documents import JsonMapping, JsonObject
 from cnpgen.errors import DatasetError
-from cnpgen.store.files.document_structure import ANY_KEY, NUMBER, TEXT, WHOLE
+from cnpgen.store.files.document_structure import ANY_KEY, WHOLE, structure_of
 from cnpgen.store.files.documents import plain
 
 
@@ -147,20 +147,10 @@ def densities_to_json(densities: Mapping[str, DensityMap]) -> JsonObject:
     return {name: plain(vars(item)) for name, item in densities.items()}
 
 
-DENSITIES_STRUCTURE = {
-    ANY_KEY: {
-        "x": [NUMBER],
-        "y": [NUMBER],
-        "candidates": [[WHOLE]],
-        "accepted": [[WHOLE]],
-    }
-}
+_COUNTS = {"candidates": [[WHOLE]], "accepted": [[WHOLE]]}
+DENSITIES_STRUCTURE = {ANY_KEY: structure_of(DensityMap) | _COUNTS}
 SAMPLING_STRUCTURE = {
-    "tried": WHOLE,
-    "accepted": WHOLE,
-    "rejections": {ANY_KEY: WHOLE},
-    "stages": {ANY_KEY: TEXT},
-    "verification": {ANY_KEY: NUMBER},
+    **structure_of(SamplingStatistics),
     "densities": DENSITIES_STRUCTURE,
 }
 

@@ -11,10 +11,8 @@ from cnpgen.store.dataset_spec import DatasetSpec, ShardTask, shard_attributes, 
 from cnpgen.store.files.atomic import file_sha256
 from cnpgen.store.files.document_structure import (
     ANY_KEY,
-    NUMBER,
-    TEXT,
-    WHOLE,
     check_structure,
+    structure_of,
 )
 from cnpgen.store.files.documents import load_document, save_document
 from cnpgen.store.layout import WORK
@@ -68,10 +66,7 @@ class ShardRecord:
 
 
 _RECORD_STRUCTURE = {
-    **dict.fromkeys(("file", "sha256", "specification_fingerprint", "started"), TEXT),
-    **dict.fromkeys(("bytes", "rows", "first_sample_id"), WHOLE),
-    "seconds": NUMBER,
-    "versions": {ANY_KEY: TEXT},
+    **structure_of(ShardRecord),
     "sampling": SAMPLING_STRUCTURE,
     "statistics": {ANY_KEY: STATISTICS_STRUCTURE},
 }

@@ -2,7 +2,10 @@
 
 import json
 import os
+from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -16,6 +19,7 @@ from cnpgen.store.files.document_structure import (
     WHOLE,
     Nullable,
     check_structure,
+    structure_of,
 )
 from cnpgen.store.files.documents import (
     canonical_sha256,
@@ -233,3 +237,37 @@ def test_devices_and_pipes_are_refused_without_blocking(tmp_path: Path) -> None:
     for path in (Path("/dev/zero"), tmp_path / "a.json"):
         with is_refused(DatasetError):
             load_document(path, "test", version=1, structure={})
+
+
+@dataclass
+class Inner:
+    text: str
+    limits: tuple[float, ...] | None
+
+
+@dataclass
+class Outer:
+    counts: Mapping[str, int]
+    inner: tuple[Inner, ...]
+    anything: dict[str, Any]
+    array: np.ndarray
+
+    @property
+    def other(self) -> int:
+        return 0
+
+
+def test_the_structure_of_a_dataclass_is_that_of_its_fields() -> None:
+    assert structure_of(Outer) == {
+        "counts": {ANY_KEY: WHOLE},
+        "inner": [{"text": TEXT, "limits": Nullable([NUMBER])}],
+        "anything": {ANY_KEY: ANYTHING},
+        "array": ANYTHING,
+    }
+    inner = {"text": "", "limits": None}
+    stored = {"counts": {"a": 1}, "inner": [inner], "anything": {}, "array": []}
+    check_structure(stored, structure_of(Outer))
+    with pytest.raises(ValueError, match=r"inner\[0\]\.limits must be a list"):
+        check_structure(
+            stored | {"inner": [inner | {"limits": 5}]}, structure_of(Outer)
+        )

@@ -12,7 +12,7 @@ from cnpgen.documents import JsonObject
 from cnpgen.errors import DatasetError
 from cnpgen.machine.versions import installed_version, processor_entry, versions
 from cnpgen.store.files.atomic import read_file, write_file
-from cnpgen.store.files.document_structure import ANY_KEY, TEXT, WHOLE, check_structure
+from cnpgen.store.files.document_structure import check_structure, structure_of
 from cnpgen.store.files.documents import parse_json
 
 RUNS_FILE = "runs.json"
@@ -28,14 +28,6 @@ LIBRARIES = (
     "sscbirrt",
     "drake",
 )
-_STRUCTURE = {
-    "date": TEXT,
-    "processor": TEXT,
-    "cores": WHOLE,
-    "seed": WHOLE,
-    "planners": [TEXT],
-    "versions": {ANY_KEY: TEXT},
-}
 
 
 @dataclass(frozen=True)
@@ -63,6 +55,9 @@ class RunRecord:
             f"{name} {number}" for name, number in self.versions.items()
         )
         return f"{self.date}: {self.processor}, {self.cores} cores; seed {self.seed}; {libraries}"
+
+
+_STRUCTURE = structure_of(RunRecord)
 
 
 def describe_run(seed: int, planners: Sequence[str]) -> RunRecord:

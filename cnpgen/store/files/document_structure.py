@@ -8,13 +8,15 @@ A structure is one of
 * ``[structure]``: a list of values with this structure;
 * ``{"key": structure}``: a table with these keys; other keys are ignored;
 * ``{ANY_KEY: structure}``: a table with any keys and values with this structure.
+
+``structure_of`` is that of a type, such as a dataclass whose fields are stored.
 """
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, is_dataclass
 from enum import Enum
-from typing import Any
+from typing import Any, get_args, get_origin, get_type_hints
 
 Structure = Any
 ANY_KEY = "*"
@@ -41,6 +43,27 @@ class Nullable:
     """A structure, or null."""
 
     structure: Structure
+
+
+_LEAVES = {str: TEXT, int: WHOLE, float: NUMBER}
+
+
+def structure_of(hint: Any) -> Structure:
+    """Return the structure of the values of a type: a leaf, a table, a list, a dataclass, or one of these or None.
+
+    Values of other types, such as arrays, are ``ANYTHING``.
+    """
+    args = get_args(hint)
+    if is_dataclass(hint):
+        fields = get_type_hints(hint)
+        return {name: structure_of(fields[name]) for name in hint.__dataclass_fields__}
+    if type(None) in args:
+        return Nullable(structure_of(args[0]))
+    if get_origin(hint) is tuple:
+        return [structure_of(args[0])]
+    if get_origin(hint) in {dict, Mapping}:
+        return {ANY_KEY: structure_of(args[1])}
+    return _LEAVES.get(hint, ANYTHING)
 
 
 class StructureError(ValueError):
