@@ -64,3 +64,8 @@ def is_refused(
         yield caught
     assert getattr(caught.value, "argument", None) == argument
     assert portable(str(caught.value)) == RunningTest.texts
+
+
+def assert_said(text: str) -> None:
+    """Compare what a command printed with the stored wording."""
+    assert portable(text) == RunningTest.texts

@@ -6,6 +6,7 @@ import numpy as np
 
 from cnpgen.cli.main import main
 from cnpgen.plans.plan_file import load_plans
+from tests.refusals import assert_said
 
 TABLE = "goal_xyz.x,goal_xyz.y,hit_angle\n1.0,0.1,0.0\n3.0,0.0,0.1\n1.1,-0.2,0.2\n"
 
@@ -38,7 +39,7 @@ def test_what_is_there_is_replaced_only_with_force(tmp_path, monkeypatch, capsys
         "--json",
     ]
     assert main(command) == 2
-    assert "problems.h5 exists: --force replaces it" in capsys.readouterr().err
+    assert_said(capsys.readouterr().err)
     assert main([*command, "--force"]) == 0
     facts = json.loads(capsys.readouterr().out)
     assert facts["without_answer"] == [

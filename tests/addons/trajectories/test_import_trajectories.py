@@ -17,7 +17,7 @@ from cnpgen.plans.exporter import sample_plan
 from cnpgen.trajectories import Trajectory, import_trajectories, largest_error
 from tests.examples.plan_files import plans_of
 from tests.examples.plans import PROBLEMS, ROBOTS, load
-from tests.refusals import is_refused
+from tests.refusals import assert_said, is_refused
 
 
 def positions(plans: Plans, rate: float, noise: float = 0.0) -> Trajectory:
@@ -193,7 +193,7 @@ def test_the_command_writes_a_plan_file(
     plans = cnpgen.load_plans(out)
     assert plans.source == "imported from out"
     assert main(words) == 2
-    assert "exists" in capsys.readouterr().err
+    assert_said(capsys.readouterr().err)
     assert main([*words, "--force"]) == 0
 
 
