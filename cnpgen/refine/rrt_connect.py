@@ -33,7 +33,7 @@ STATE_SPACING = 0.04  # rad or m, between checked states
 MAX_TURN = 2 * np.pi
 
 # Links of a robot whose distances are residuals.
-NO_SHAPE = Shape((), {}, (), ())
+WITHOUT_LINKS = Shape((), {}, (), ())
 # Of small trees in turn, added to the required distances.
 TREE_MARGINS_M = 6e-3, 3e-3, 1e-3, 0.0
 SMALL_TREES, SMALL_TREE_EXTENSIONS = 12, 4_000  # four, if these find too few paths
@@ -189,7 +189,7 @@ class TreeSearch:
             np.minimum(robot.position_upper, upper),
         )
         checker = (
-            CollisionChecker(self.library, robot, NO_SHAPE)
+            CollisionChecker(self.library, robot, WITHOUT_LINKS)
             if hulls is None
             else hulls.placed_checker(task.scene.poses[0])
         )

@@ -21,7 +21,7 @@ from cnpgen.kernels.interpreted_kernel import InterpretedKernel
 from cnpgen.kernels.library import KernelLibrary, choose_backend
 from cnpgen.kernels.tape import tape_from_function
 from cnpgen.problems.load_robot import load_robot
-from cnpgen.refine.rrt_connect import NO_SHAPE
+from cnpgen.refine.rrt_connect import WITHOUT_LINKS
 from cnpgen.robots.solid import place_obstacles
 from tests.conftest import needs_compiler
 from tests.examples.coal_hulls import CoalHulls
@@ -171,7 +171,7 @@ def search_at_rest(setting, residuals, seed=0, lower=0.0, scene=GATE_HEIGHT):
         np.array([np.inf, 0.6, 1.0]),
     )
     return find_tree_path(
-        CollisionChecker(checker.library, robot, NO_SHAPE),
+        CollisionChecker(checker.library, robot, WITHOUT_LINKS),
         tuple(BESIDE_WALL),
         (robot.position_lower, robot.position_upper),
         robot.velocity_limit,
