@@ -281,6 +281,9 @@ def _with_entries(urdf: str, entries: list[dict[str, str]], source: str) -> str:
     for entry in entries:
         if missing := [key for key in _PAIR if key not in entry]:
             raise RecipeError([f"{source}: {entry} lacks {', '.join(missing)}"])
+        if entry["link1"] == entry["link2"]:
+            text = f"a pair names the link {entry['link1']!r} twice"
+            raise RecipeError([f"{source}: {text}"])
     named = {entry[key] for entry in entries for key in _PAIR}
     if unknown := sorted(named - links):
         raise RecipeError([f"{source}: the URDF has no link {', '.join(unknown)}"])

@@ -500,6 +500,16 @@ def test_links_of_an_srdf_that_the_urdf_lacks_are_a_warning(tmp_path, caplog):
         with_ignored_pairs(text, [("hand", "foot")])
 
 
+def test_a_pair_of_one_link_is_refused(tmp_path):
+    with pytest.raises(RecipeError, match="names the link 'hand' twice"):
+        with_ignored_pairs(urdf(), [("hand", "hand")])
+    srdf = tmp_path / "crane.srdf"
+    entry = '<disable_collisions link1="hand" link2="hand"/>'
+    srdf.write_text(f"<robot>{entry}</robot>")
+    with pytest.raises(RecipeError, match="names the link 'hand' twice"):
+        with_disabled_pairs(urdf(), srdf)
+
+
 @pytest.mark.parametrize(
     ("content", "text"),
     [

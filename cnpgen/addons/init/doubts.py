@@ -13,6 +13,7 @@ from cnpgen.robots.urdf_elements import unread_elements
 
 MAX_SPEED_RAD_S = 50.0  # of a revolute joint; faster ones are probably in deg/s
 MAX_ANGLE_RAD = 2 * math.pi + 1e-6  # of a roll, pitch or yaw
+MAX_AXIS_ERROR = 1e-3  # of the length of an axis, 1
 MAX_CENTER_TO_LINK_RATIO = 2.0  # distance of a centre of mass / size of its link
 MIN_CENTER_M = 0.1  # smaller distances are not doubted
 MIN_MASS_KG = 0.01  # of bodies with an inertia
@@ -40,8 +41,13 @@ def _of_joint(joint: Element) -> Iterator[str]:
     name = joint.get("name", "")
     kind = joint.get("type")
     limit = joint.find("limit")
-    if kind in {"revolute", "continuous", "prismatic"} and joint.find("axis") is None:
-        yield f"joint {name}: it has no <axis>, so that it moves along or about 1 0 0"
+    axis = joint.find("axis")
+    if kind in {"revolute", "continuous", "prismatic"}:
+        length = math.hypot(*numbers_in(axis, "xyz", (1.0, 0.0, 0.0)))
+        if axis is None:
+            yield f"joint {name}: it has no <axis>, so that it moves along or about 1 0 0"
+        elif abs(length - 1) > MAX_AXIS_ERROR:
+            yield f"joint {name}: its <axis> has the length {length:.4g}: only its direction counts"
     if kind in {"revolute", "prismatic"} and limit is not None:
         missing = [key for key in ("lower", "upper") if key not in limit.attrib]
         if len(missing) == 1:

@@ -190,6 +190,10 @@ def test_followers_of_a_locked_joint_have_their_offset(tmp_path: Path) -> None:
             "joint g1: it has no <axis>, so that it moves along or about 1 0 0",
         ),
         (
+            {"more": finger().replace('<axis xyz="0 0 1"/>', '<axis xyz="0 0 2"/>')},
+            "joint g1: its <axis> has the length 2: only its direction counts",
+        ),
+        (
             {"upper": UPPER.replace("0.2 0 0", "1.4 0 0") + SHAPE},
             "link upper: its center of mass is 1.4 m from its origin, the link reaches 0.45 m",
         ),
