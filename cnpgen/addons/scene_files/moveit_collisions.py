@@ -8,8 +8,9 @@ from typing import Any
 
 from cnpgen.addons.scene_files.document_values import part, scalar
 from cnpgen.documents import Names
+from cnpgen.errors import nearest
 from cnpgen.problems.scenes.scene_problem import SceneError
-from cnpgen.store.files.accounted import AccountedMapping
+from cnpgen.store.files.accounted import MISSPELT, AccountedMapping
 
 MAX_SCALE = 10.0
 MAX_PADDING_M = 1.0
@@ -76,6 +77,11 @@ def read_allowed_collisions(
             touching.setdefault(body, []).extend(others)
     if matrix:
         scene.account.unused.append(ACM)
+    # A name that is no object may be a link, or a misspelt object.
+    known = {*world, *attached}
+    for name in sorted(names - known):
+        if hint := nearest(name, sorted(known - names), similarity=MISSPELT):
+            scene.account.unused.append(f"{ACM}.{name}{hint}")
     if refused:
         text = "expected pairs, or names without a default of false that all may touch"
         scene.account.refuse(ACM, refused[0], text)

@@ -23,7 +23,7 @@ from cnpgen.robots.robot import Robot
 from cnpgen.robots.shape.convex_part import turned
 from cnpgen.scenes import SceneError, load_scenes, save_scenes, solve_scenes
 from tests.addons.scene_files.moveit_messages import document
-from tests.addons.scene_files.test_moveit_unused import OTHER, changed
+from tests.addons.scene_files.test_moveit_unused import OTHER, changed, minimal
 from tests.conftest import needs_compiler
 from tests.examples.example_robots import needs_robots
 from tests.refusals import is_refused
@@ -757,6 +757,24 @@ def test_elements_that_are_not_used_do_not_change_plans_and_verdicts(tmp_path):
         report = [verdict.to_dict() for verdict in verdicts.verdicts]
         found.append((bytes_of, plans.problem, verdicts.summary(), report))
     assert found[0] == found[1]
+
+
+def test_a_misspelt_object_in_a_matrix_is_listed(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    caplog.set_level("INFO", "cnpgen")
+    shelf = {"id": "shelf", "primitives": [{"type": 1, "dimensions": [0.1] * 3}]}
+    shelf["primitive_poses"] = [{"position": [1, 0, 0], "orientation": [0, 0, 0, 1]}]
+    content = minimal() | {"world": {"collision_objects": [shelf]}}
+    for name, listed in (("shelf", False), ("shef", True), ("panda_hand", False)):
+        caplog.clear()
+        rows = [{"enabled": [False, True]}, {"enabled": [True, False]}]
+        entries = {"entry_names": [name, "panda_link5"], "entry_values": rows}
+        document = content | {"allowed_collision_matrix": entries}
+        (tmp_path / "scene.yaml").write_text(json.dumps(document))
+        load_scenes(tmp_path / "scene.yaml")
+        text = "allowed_collision_matrix.shef (did you mean 'shelf'?)"
+        assert (text in caplog.text) == listed
 
 
 def test_a_matrix_that_allows_and_forbids_a_pair_is_refused(tmp_path: Path) -> None:
