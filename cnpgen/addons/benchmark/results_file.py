@@ -160,7 +160,7 @@ RESULTS = RecordFormat(
     "cnpgen-benchmark",
     2,
     "a file of results of cnpgen",
-    "{force} overwrites its results, another folder keeps them",
+    "{force} discards its results, another folder keeps them",
     "force",
     _checked_row,
     checked=False,
@@ -285,11 +285,8 @@ class ResultsFolder:
             elif delete_others:
                 path.unlink()
             else:
-                raise UsageError(
-                    f"{path} holds results of another run (suite, version, time limit or seed differ);"
-                    " {force} deletes them, another folder keeps them",
-                    remedies={"force": True},
-                )
+                known = {name: head.get(name) for name in RESULTS.head(self._shared)}
+                RESULTS.require(path, known, self._shared)
         return names
 
     def open(

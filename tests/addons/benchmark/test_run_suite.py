@@ -703,8 +703,9 @@ def test_a_report_covers_the_folder_and_nothing_else(
             n=1,
             options=BenchmarkOptions(reference="solve"),
         )
+    head = json.loads((folder / "random.jsonl").read_text().splitlines()[0])
     (folder / "other.jsonl").write_text(
-        '{"format": "cnpgen-benchmark", "suite": "heavy-100"}\n'
+        json.dumps(head | {"suite": "heavy-100"}) + "\n"
     )
     with is_refused(UsageError, argument="force"):
         run_benchmark("hits-81", folder, planners=[random], n=1)
