@@ -71,7 +71,7 @@ def test_soft_limits_make_a_motion_invalid(tmp_path: Path) -> None:
 def test_a_reversal_between_samples_is_part_of_the_uncertainty(tmp_path: Path) -> None:
     """Noise of the velocity near the reversal may turn all of the friction."""
     drive = "friction_help = 1\nviscous = 0\ncoulomb = [0.1, 0.1, 0.1, 19]"
-    problem = used(tmp_path, drive)
+    problem = arm(tmp_path, f'[drive]\nurdf_dynamics = "ignore"\n{drive}')
     motion = quintic(200, 0.4, back=True)
     known, noisy = (
         evaluate_trajectories(problem, [motion], interpolation="quintic", noise=noise)
