@@ -134,15 +134,12 @@ def _tolerance_notes(problem: Problem) -> Iterator[str]:
 
 def _friction_errors(problem: Problem, raw: ProblemTables, path: Path) -> Iterator[str]:
     """Yield errors about friction of the URDF that is not decided on, or that is to be used and not there."""
-    drive = problem.drive
     if raw.urdf is None or problem.first(JointTorque) is None:
         return
     undecided = undecided_friction(raw.urdf, problem.robot.joints)
     if "urdf_dynamics" in raw.table.get("drive", {}):
-        if drive.urdf_dynamics == "use" and not undecided:
+        if problem.drive.urdf_dynamics == "use" and not undecided:
             yield f"{path}: drive.urdf_dynamics: the URDF has no friction to use"
-        elif drive.urdf_dynamics == "use" and drive.viscous and drive.coulomb:
-            yield f"{path}: drive.urdf_dynamics: 'viscous' and 'coulomb' replace the URDF's friction"
     elif undecided and problem.version > 1:
         yield f"{path}: drive.urdf_dynamics: missing; {undecided}"
     # Files of version 1 ignored friction silently: an error would reject them.

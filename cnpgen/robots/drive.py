@@ -129,15 +129,13 @@ class DriveSpec:
         if self.limits == "joint":
             names = (key.name for key in keys(type(self)) if key.name != "limits")
             return {f"drive.{name}": "limit of motors" for name in names}
+        idle = {} if self.has_friction else {"drive.reversal_speed": "friction"}
         # The limit of the motors takes the place of that of the joints.
-        idle = (
-            {"limits.torque": "limit of joints"}
-            if self.limits == "motor" and self.torque
-            else {}
-        )
-        return (
-            idle if self.has_friction else idle | {"drive.reversal_speed": "friction"}
-        )
+        if self.limits == "motor" and self.torque:
+            idle["limits.torque"] = "limit of joints"
+        if self.viscous and self.coulomb:
+            idle["drive.urdf_dynamics"] = "friction without a key of its own"
+        return idle
 
 
 NO_DRIVE = DriveSpec()

@@ -258,6 +258,19 @@ def test_a_factor_of_an_inertia_needs_one(tmp_path: Path) -> None:
         assert np.array_equal(values_of(problem), values_of(whole)) == named
 
 
+def test_friction_of_the_urdf_may_be_missing_or_replaced(tmp_path: Path) -> None:
+    use = 'urdf_dynamics = "use"'
+    with pytest.raises(RecipeError, match="the URDF has no friction to use"):
+        problem_of(tmp_path, {"drive": use}, "torque")
+    for more, named in (
+        ("", False),
+        ("viscous = 1", False),
+        ("viscous = 1\ncoulomb = 1", True),
+    ):
+        problem = problem_of(tmp_path, {"drive": f"{use}\n{more}"}, "torque", "damping")
+        assert ("drive.urdf_dynamics" in idle_keys(problem)) == named
+
+
 def test_a_plug_in_without_declared_keys_may_read_all(tmp_path: Path) -> None:
     problem = problem_of(tmp_path, {"limits": "jerk = 9"}, "velocity")
     assert list(idle_keys(problem)) == ["limits.jerk"]
