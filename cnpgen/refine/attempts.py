@@ -18,7 +18,7 @@ import numpy as np
 
 from cnpgen.arrays import Array
 from cnpgen.kernels.collision.collision_checker import MAX_JOINTS
-from cnpgen.refine.grid_levels import MAX_INITIAL_VIOLATION
+from cnpgen.refine.grid_levels import MAX_INITIAL_VIOLATION, GridLevel
 from cnpgen.refine.refiner import Refiner
 from cnpgen.refine.solver.sqp import Result
 from cnpgen.refine.task import MAX_JUDGED_VIOLATION, Attempt, Outcome, RefinementTask
@@ -27,6 +27,8 @@ from cnpgen.trajectory.spline_motion import Motion
 
 # Tolerances; attempts with larger violations are left for joint-space paths.
 NEARLY_VALID = 30.0
+# Of the usual level along tree paths, before that for such paths follows it.
+MAX_FAILURES = 1
 MAX_PENETRATION_M = 0.02  # of links in a plan that hull levels continue from
 # Of the initial line, above which joint-space paths come first.
 MAX_LINE_PENETRATION_M = 0.05
@@ -84,7 +86,7 @@ def _all_attempts(
         yield from around_obstacles(refiner, task, best)
     elif task.at_rest and refiner.robot.n <= MAX_JOINTS:
         for guess in path_guesses(refiner, task):
-            yield along_path(refiner, task, guess)
+            yield along_path(refiner, task, refiner.levels.path, guess)
 
 
 def _best_of(
@@ -274,11 +276,18 @@ def along_tree_paths(
 
     Without a path only ``best``, as one without.
     """
-    found_path = False
+    failures, found_path = 0, False
     for guess in path_guesses(refiner, task):
         found_path = True
-        attempt = along_path(refiner, task, guess)
+        # Trees avoid the hulls, so that their paths are nearly valid: the usual level
+        # is faster, and loses few of them.
+        attempt = along_path(refiner, task, refiner.levels.warm, guess)
         yield attempt
+        failed = attempt.violation > MAX_JUDGED_VIOLATION
+        failures += failed
+        if failed and failures > MAX_FAILURES:
+            attempt = along_path(refiner, task, refiner.levels.path, guess)
+            yield attempt
         # Such attempts fail by little: the strict level may close the rest.
         if attempt.violation <= MAX_JUDGED_VIOLATION:
             yield refiner.solve(
@@ -304,7 +313,7 @@ def around_obstacles(
     if best_first:
         yield from _on_hulls(refiner, task, best)
     for guess in path_guesses(refiner, task):
-        attempt = along_path(refiner, task, guess)
+        attempt = along_path(refiner, task, refiner.levels.path, guess)
         yield attempt
         yield from _on_hulls(
             refiner, task, attempt if attempt.violation <= 1 else guess
@@ -338,13 +347,14 @@ def path_guesses(refiner: Refiner, task: RefinementTask) -> Iterator[Attempt]:
         yield refiner.measured(task, guess, Outcome.RESTARTED, unlimited=True)
 
 
-def along_path(refiner: Refiner, task: RefinementTask, guess: Attempt) -> Attempt:
-    """Optimize a motion along a joint-space path: with a high penalty of violations first, then as usual."""
-    best = refiner.solve(task, refiner.levels.path, guess.variables, Outcome.RESTARTED)
+def along_path(
+    refiner: Refiner, task: RefinementTask, level: GridLevel, guess: Attempt
+) -> Attempt:
+    """Optimize a motion along a joint-space path on a level, and then as usual."""
+    best = refiner.solve(task, level, guess.variables, Outcome.RESTARTED)
     # A second run on the level on which the first one ended changes nothing.
     same_level = (
-        refiner.levels.path is refiner.levels.warm
-        and best.outcome is not Outcome.TIME_SCALED
+        level is refiner.levels.warm and best.outcome is not Outcome.TIME_SCALED
     )
     if best.violation <= 1 and not same_level:
         again = refiner.solve(

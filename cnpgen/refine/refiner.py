@@ -53,7 +53,7 @@ from cnpgen.refine.solver.transcription import (
     Transcription,
     cache_last,
 )
-from cnpgen.refine.task import Attempt, Outcome, RefinementTask
+from cnpgen.refine.task import MAX_JUDGED_VIOLATION, Attempt, Outcome, RefinementTask
 from cnpgen.robots.robot import Robot
 from cnpgen.robots.solid import pose_width
 from cnpgen.trajectory.boundary import Boundary
@@ -143,9 +143,6 @@ class Refiner:
     def _prepare_levels(self, solved: Problem, chosen: GridLevels | None) -> None:
         """Prepare the grids and the bounds of the chosen or usual levels, for the problem that is solved."""
         self.levels = chosen or default_grid_levels(self.problem, self.settings)
-        if self.measures_hulls and chosen is None:
-            # Trees avoid the hulls, so that their paths are nearly valid.
-            self.levels = replace(self.levels, path=self.levels.warm)
         levels: tuple[GridLevel, ...] = tuple(vars(self.levels).values())
         self._grids = {
             points: make_grid(self.spec, points, self.problem.path_orders)
@@ -192,7 +189,8 @@ class Refiner:
         [m], shape (K, columns), for a motion that is nearly valid.
         """
         motion = self.transcription(task, level)
-        settings = level.settings if extra is None else self.levels.strict.settings
+        kept = extra is None or level is self.levels.path
+        settings = level.settings if kept else self.levels.strict.settings
         ends = motion.end_residuals()
         bounds = self.bounds(task, level, ends)
         # No step can change the boundary states; the solver only evaluates the motion.
@@ -253,7 +251,19 @@ class Refiner:
         result = self.run_level(task, level, x, hulls)
         if self.measures_hulls:
             result = self._separated(task, level, result)
-        return self.measured(task, result.x, outcome, result.iterations)
+        attempt = self.measured(task, result.x, outcome, result.iterations)
+        # Valid at the grid points, but not between them: it passes through something
+        # thin, which more points show.
+        passes_through = (
+            result.violation <= self.settings.violation_tolerance
+            and attempt.violation > MAX_JUDGED_VIOLATION
+        )
+        fine = self.levels.fine
+        if self.measures_hulls and passes_through and level.points < fine.points:
+            finer = self.solve(task, fine, attempt.variables, outcome)
+            finer = replace(finer, iterations=finer.iterations + result.iterations)
+            attempt = finer if finer.is_better(attempt) else attempt
+        return attempt
 
     def continue_scaled(self, task: RefinementTask, best: Attempt) -> Attempt:
         """Optimize a motion that was scaled in time again, while it becomes cheaper.

@@ -42,11 +42,12 @@ MAX_TREE_PATHS = 8
 MAX_CHECKED_PATHS = 5  # of trees that check all conditions
 LARGE_TREE_EXTENSIONS = 128_000  # without margin, in narrow passages
 # With edges of either length; three if no tree connects.
-LARGE_TREES = 12
+LARGE_TREES = 6
 MAX_UNCONNECTED_TREES = 3
 # Length of an edge [rad or m]; shorter ones after the others.
 TREE_EXTENSION_RAD = 1.0
-SHORT_TREE_EXTENSION_RAD = 0.5
+LARGE_TREE_EXTENSION_RAD = 0.5
+SHORT_TREE_EXTENSION_RAD = 0.3
 TREE_SHORTCUTS = 400  # attempted on a path
 # Of projected states, which are all nodes, so that trees have more of them.
 MANIFOLD_SPACING_RAD = 0.04
@@ -125,7 +126,7 @@ class TreeSearch:
         # Large trees only if small ones find too few paths.
         missing = max(MIN_TREE_PATHS - len(found), 0)
         found += islice(
-            self._large_trees(seeds, TREE_EXTENSION_RAD, bool(found)), missing
+            self._large_trees(seeds, LARGE_TREE_EXTENSION_RAD, bool(found)), missing
         )
         limit = self.robot.velocity_limit
         # Paths that meet all other conditions come first, then the fastest.

@@ -14,12 +14,13 @@ from cnpgen.problems.load_robot import load_robot
 from cnpgen.problems.problem_file import load_problem
 from cnpgen.refine import attempts, rrt_connect
 from cnpgen.refine import refiner as refiner_module
+from cnpgen.refine.grid_levels import GridLevel
 from cnpgen.refine.refiner import Refiner
 from cnpgen.refine.solver.hull_levels import HullFeedback
 from cnpgen.refine.solver.hulls import MEASURED_RANGE_M, has_clearance_constraints
-from cnpgen.refine.solver.sqp import DEFAULT_SETTINGS
+from cnpgen.refine.solver.sqp import DEFAULT_SETTINGS, Result
 from cnpgen.refine.strategy import PlanChecker, RefinementSearch, refine_task
-from cnpgen.refine.task import Outcome
+from cnpgen.refine.task import MAX_JUDGED_VIOLATION, Outcome
 from cnpgen.robots.solid import place_obstacles
 from cnpgen.trajectory.spline_motion import Motion
 from cnpgen.world.world import World
@@ -361,6 +362,54 @@ def test_a_collision_of_the_verdict_becomes_larger_distances_around_its_phase(tm
     assert (extra[3][collides] > 0.003).all()
 
 
+@needs_compiler
+def test_motions_through_a_wall_between_grid_points_are_continued_on_the_fine_level(tmp_path, monkeypatch):  # fmt: skip
+    problem = narrow(tmp_path, WALL)
+    tool, task = refiner(problem), between(problem, BESIDE_WALL)
+    guess, levels = tool.line_guess(task), list[GridLevel]()  # through the wall
+
+    violations = [0.0, 0.0, 0.1]  # at the grid points
+
+    def run_level(_, level, x, *__):
+        levels.append(level)
+        return Result(x, 1.0, violations[len(levels) - 1], 1, converged=True)
+
+    monkeypatch.setattr(tool, "run_level", run_level)
+    warm, fine = tool.levels.warm, tool.levels.fine
+    for _ in range(2):  # the second time there is a violation at the grid points
+        attempt = tool.solve(task, warm, guess, Outcome.SOLVED)
+        assert attempt.violation > MAX_JUDGED_VIOLATION
+    assert levels == [warm, fine, warm]
+
+
+def test_the_level_for_paths_follows_the_usual_one_from_its_second_failure(monkeypatch):
+    violations = {("warm", 3): 0.5, ("path", 2): 0.1}  # others fail
+    made = list[tuple[str, int]]()
+
+    def along(refiner, task, level, guess):
+        made.append((level, guess))
+        violation = violations.get((level, guess), 9.0)
+        return SimpleNamespace(violation=violation, variables=None)
+
+    monkeypatch.setattr(attempts, "path_guesses", lambda *_: range(4))
+    monkeypatch.setattr(attempts, "along_path", along)
+    levels = SimpleNamespace(warm="warm", path="path", strict="strict")
+    solved = list[str]()
+    tool = SimpleNamespace(
+        levels=levels, solve=lambda task, level, *_: solved.append(level)
+    )
+    list(attempts.along_tree_paths(tool, None, None))
+    assert made == [
+        ("warm", 0),
+        ("warm", 1),
+        ("path", 1),
+        ("warm", 2),
+        ("path", 2),
+        ("warm", 3),
+    ]
+    assert solved == ["strict", "strict"]
+
+
 def test_large_trees_follow_the_first_ones(monkeypatch):
     grown, hits = (
         list[TreeSettings](),
@@ -387,11 +436,11 @@ def test_large_trees_follow_the_first_ones(monkeypatch):
     )
     search = rrt_connect.TreeSearch(task, robot, None, None, None, hulls, True)
     cases = (
-        ({0, 1, 3}, (12, 0, 12)),  # small trees with every margin find enough paths
+        ({0, 1, 3}, (12, 0, 6)),  # small trees with every margin find enough paths
         (set(), (4, 3, 3)),  # nothing connects
-        ({0, 3}, (4, 12, 12)),
-        ({1, 5, 6, 9}, (4, 3, 12)),  # large trees find the missing paths
-        ({8}, (4, 3, 12)),
+        ({0, 3}, (4, 6, 6)),
+        ({1, 5, 6, 9}, (4, 3, 6)),  # large trees find the missing paths
+        ({8}, (4, 3, 6)),
     )
     for numbers, expected in cases:
         grown.clear()
@@ -401,7 +450,7 @@ def test_large_trees_follow_the_first_ones(monkeypatch):
         assert kinds == [
             kind
             for kind, count in zip(
-                [(4_000, 1.0), (128_000, 1.0), (128_000, 0.5)], expected, strict=True
+                [(4_000, 1.0), (128_000, 0.5), (128_000, 0.3)], expected, strict=True
             )
             for _ in range(count)
         ]
