@@ -15,6 +15,7 @@ from cnpgen.plans.format import PlanStatus
 from cnpgen.plans.join import join_plans
 from cnpgen.refine.refine_plans import refine_plans
 from cnpgen.robots.plausible_values import UnitError
+from cnpgen.store.scene_table import OBSTACLE_POSES
 from cnpgen.trajectory.boundary import Boundary
 from tests.conftest import columns_of, some
 from tests.examples.models import boundary_of_columns, untrained_model
@@ -311,6 +312,12 @@ def test_goal_accelerations_raise_an_error_if_the_model_leaves_them_free(planner
 
 def test_no_tasks_give_no_plans(planner, rows):
     assert len(planner.plan_batch(rows[:0])) == 0
+
+
+def test_no_tasks_of_a_model_with_corrected_lines_give_no_plans() -> None:
+    none = draw_boundary_problems("panda-scenes", 1)[:0]
+    poses = {OBSTACLE_POSES: none.columns[OBSTACLE_POSES]}
+    assert len(Planner("panda-scenes").plan_batch(none.boundary, columns=poses)) == 0
 
 
 def test_plans_are_the_same_on_every_backend(planner, rows):

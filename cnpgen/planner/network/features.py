@@ -188,7 +188,8 @@ def _block(tasks: Tasks, name: str) -> tuple[AnyArray, ...]:
     if name == SCENE and tasks.observation is not None:
         return (tasks.observation,)
     if name == LINE and tasks.correction is not None:
-        return (tasks.correction.reshape(len(tasks), -1),)
+        count, points, joints = tasks.correction.shape
+        return (tasks.correction.reshape(count, points * joints),)
     raise ValueError(
         f"unknown feature block {name!r}: expected one of {', '.join(BLOCKS)}"
     )
