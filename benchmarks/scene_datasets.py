@@ -5,7 +5,6 @@ evaluates the plans with SciPy, and measures collisions of the URDF's meshes wit
 """
 
 import argparse
-import re
 import time
 from collections.abc import Iterator
 from importlib import metadata
@@ -202,7 +201,6 @@ class Meshes:
             self.model.frames[each.parentFrame].name
             for each in self._links.geometryObjects
         ]
-        names = [re.sub(r"_\d+$", "", name) for name in names]
         joint = [each.parentJoint for each in self._links.geometryObjects]
         self._moving = [index for index, carrier in enumerate(joint) if carrier > 0]
         self._self_pairs = [
