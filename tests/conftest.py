@@ -37,6 +37,8 @@ import numpy as np
 import pytest
 from syrupy.assertion import SnapshotAssertion
 
+from cnpgen.kernels.c_library import ARRAYS, find_built
+from cnpgen.kernels.collision.collision_checker import SOURCES
 from cnpgen.kernels.compiler import find_compiler
 from cnpgen.kernels.library import Backend, KernelLibrary, default_cache_folder
 from cnpgen.make.make_dataset import make_dataset
@@ -80,6 +82,10 @@ def _marked(value: Any, mark: str) -> Any:
 
 needs_compiler = pytest.mark.skipif(
     find_compiler() is None, reason="no C compiler on this machine"
+)
+needs_compiled_code = pytest.mark.skipif(
+    find_compiler() is None and not find_built((ARRAYS, *SOURCES)),
+    reason="neither compiled C code of the package nor a C compiler",
 )
 
 pytest_plugins = ["pytester"]

@@ -5,11 +5,9 @@ from functools import cache
 from typing import Any
 
 import numpy as np
-import pytest
 
 from cnpgen.judges.plans import Verdict, judge
-from cnpgen.kernels.compiler import find_compiler
-from cnpgen.kernels.library import KernelLibrary, default_cache_folder, problem_kernels
+from cnpgen.kernels.library import KernelLibrary, choose_backend, problem_kernels
 from cnpgen.problems.objectives import ObjectiveTerm, read_objective
 from cnpgen.problems.problem import Problem
 from cnpgen.refine.grid_levels import GridLevels
@@ -31,10 +29,6 @@ from cnpgen.trajectory.boundary import Boundary
 from cnpgen.trajectory.spline_motion import Motion
 from cnpgen.trajectory.trajectory_spec import TrajectorySpec
 from tests.examples.plans import PROBLEMS, ROBOTS, Plan
-
-needs_compiler = pytest.mark.skipif(
-    find_compiler() is None, reason="there is no C compiler"
-)
 
 
 def cost_term_of(name: str, weight: float) -> CostTerm:
@@ -69,8 +63,7 @@ def transcription_of(
 @cache
 def library(name: str) -> KernelLibrary:
     problem, robot = PROBLEMS[name], ROBOTS[name]
-    backend = "compiled" if find_compiler() else "numpy"
-    return problem_kernels(problem, robot, backend, default_cache_folder())
+    return problem_kernels(problem, robot, *choose_backend(None))
 
 
 @cache

@@ -19,10 +19,10 @@ from cnpgen.robots.shape.convex_part import Contacts, turned
 from cnpgen.robots.shape.hull import coal_hull
 from cnpgen.robots.shape.inline import address_of
 from cnpgen.robots.solid import place_obstacles
-from tests.conftest import needs_compiler
+from tests.conftest import needs_compiled_code
 from tests.examples.shaped_robot import WEDGE, write_problem
 
-pytestmark = needs_compiler
+pytestmark = needs_compiled_code
 
 KINDS = ("box", "sphere", "cylinder", "capsule", "mesh", "large mesh")
 DIRECTIONS = np.random.default_rng(11).normal(size=(500, 3))

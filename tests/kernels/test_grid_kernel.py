@@ -17,7 +17,7 @@ from cnpgen.kernels.kernel import GridKernel
 from cnpgen.kernels.library import KernelLibrary
 from cnpgen.kernels.lowering import lower
 from cnpgen.kernels.tape import Axes, GridSpec, Loop, Tape, tape_from_function
-from tests.conftest import needs_compiler
+from tests.conftest import needs_compiled_code
 from tests.examples.casadi_kernels import MappedGridKernel
 from tests.kernels.test_kernels import BINARY, REFERENCE, SPECIAL, UNARY
 from tests.refusals import is_refused
@@ -247,7 +247,7 @@ def ulps(found: Array, expected: Array) -> Array:
 
 
 @pytest.mark.parametrize(
-    "backend", [pytest.param("compiled", marks=needs_compiler), "numpy"]
+    "backend", [pytest.param("compiled", marks=needs_compiled_code), "numpy"]
 )
 @pytest.mark.parametrize("name", [*UNARY, *BINARY])
 def test_operations_in_float32_follow_ieee_754(

@@ -26,7 +26,7 @@ from cnpgen.kernels.interpreted_kernel import (
 from cnpgen.kernels.kernel import Kernel
 from cnpgen.kernels.library import KernelLibrary, choose_backend
 from cnpgen.kernels.tape import CODES, NAMES, Loop, Tape, tape_from_function
-from tests.conftest import Prepare, needs_compiler, some
+from tests.conftest import Prepare, needs_compiled_code, some
 from tests.examples.casadi_kernels import MappedKernel
 from tests.refusals import is_refused
 
@@ -395,7 +395,7 @@ def test_lanes_of_a_loop_do_not_depend_on_their_neighbors(
 
 
 @pytest.mark.parametrize(
-    "backend", [pytest.param("compiled", marks=needs_compiler), "numpy"]
+    "backend", [pytest.param("compiled", marks=needs_compiled_code), "numpy"]
 )
 @pytest.mark.parametrize("kind", ["inverse kinematics", "hitting configuration"])
 def test_solvers_give_the_same_bits_in_any_order_of_lanes(

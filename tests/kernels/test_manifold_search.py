@@ -12,12 +12,12 @@ from cnpgen.refine.strategy import PlanChecker, refine_task
 from cnpgen.robots.solid import place_obstacles
 from cnpgen.trajectory.spline_motion import Motion
 from cnpgen.world.world import World
-from tests.conftest import needs_compiler
+from tests.conftest import needs_compiled_code
 from tests.examples.coal_hulls import CoalHulls
 from tests.examples.narrow import BESIDE_WALL, LIMITS, SLOT, WALL, between
 from tests.examples.shaped_robot import write_problem
 
-pytestmark = needs_compiler
+pytestmark = needs_compiled_code
 
 HEIGHT_M, SPACING = 0.75, 0.04
 LEVEL = (

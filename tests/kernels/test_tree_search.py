@@ -23,11 +23,11 @@ from cnpgen.kernels.tape import tape_from_function
 from cnpgen.problems.load_robot import load_robot
 from cnpgen.refine.rrt_connect import WITHOUT_LINKS
 from cnpgen.robots.solid import place_obstacles
-from tests.conftest import needs_compiler
+from tests.conftest import needs_compiled_code
 from tests.examples.coal_hulls import CoalHulls
 from tests.examples.narrow import BESIDE_WALL, WALL, narrow
 
-pytestmark = needs_compiler
+pytestmark = needs_compiled_code
 
 
 @pytest.fixture(scope="module")

@@ -19,11 +19,11 @@ from cnpgen.robots.obstacle import Obstacle
 from cnpgen.robots.shape.convex_part import turned
 from cnpgen.robots.shape.hull import CUBE
 from cnpgen.robots.solid import number_slices, place_obstacles
-from tests.conftest import needs_compiler
+from tests.conftest import needs_compiled_code
 from tests.examples.clearance_reference import ClearanceLossReference
 from tests.examples.shaped_robot import write_problem
 
-pytestmark = needs_compiler
+pytestmark = needs_compiled_code
 
 SCENE = (
     Obstacle(

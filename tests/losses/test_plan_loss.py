@@ -16,7 +16,7 @@ from cnpgen.problems.constraints.constraint import Condition, Constraint
 from cnpgen.problems.problem import Problem
 from cnpgen.schema.keys import field
 from cnpgen.trajectory.spline_motion import Motion
-from tests.conftest import needs_compiler, some
+from tests.conftest import needs_compiled_code, some
 from tests.examples.jerk_limits import jerk_limited
 from tests.examples.losses import (
     PROBLEM_OF,
@@ -231,7 +231,7 @@ GARBAGE = {
 
 @pytest.mark.parametrize("what", GARBAGE)
 @pytest.mark.parametrize(
-    "backend", [pytest.param("compiled", marks=needs_compiler), "numpy"]
+    "backend", [pytest.param("compiled", marks=needs_compiled_code), "numpy"]
 )
 def test_an_invalid_plan_has_a_loss_of_nan_and_does_not_affect_others(what, backend):
     of, given = (

@@ -25,12 +25,12 @@ from cnpgen.store.reader import open_dataset
 from cnpgen.training.data import open_training_data
 from cnpgen.training.settings import TrainingSettings
 from cnpgen.world.world import World
-from tests.conftest import needs_compiler
+from tests.conftest import needs_compiled_code
 from tests.examples.forged_shards import edit
 from tests.examples.scene_arm import PIPELINE, obstacles_of, write_scene_pipeline
 from tests.refusals import is_refused
 
-pytestmark = needs_compiler  # NumPy takes minutes
+pytestmark = needs_compiled_code  # NumPy takes minutes
 ROWS = 240
 ENDS_MARGIN_M = 0.005 - 1e-9
 

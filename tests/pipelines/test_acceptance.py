@@ -12,12 +12,12 @@ from cnpgen.pipelines.stages.stage import CandidateBatch
 from cnpgen.problems.constraints.constraint import Condition
 from cnpgen.robots.solid import place_obstacles
 from cnpgen.world.path import PathWorld
-from tests.conftest import SHIPPED, Prepare, needs_compiler, run_stages, some
+from tests.conftest import SHIPPED, Prepare, needs_compiled_code, run_stages, some
 
-BACKENDS = [pytest.param("compiled", marks=needs_compiler), "numpy"]
+BACKENDS = [pytest.param("compiled", marks=needs_compiled_code), "numpy"]
 NO_NUMBERS = [
     *(
-        pytest.param("compiled", value, marks=needs_compiler)
+        pytest.param("compiled", value, marks=needs_compiled_code)
         for value in (np.nan, np.inf, -np.inf)
     ),
     *(("numpy", value) for value in (np.nan, np.inf, -np.inf)),

@@ -26,14 +26,14 @@ from cnpgen.schema.catalogue import list_recipes
 from tests.conftest import (
     Arm,
     Prepare,
-    needs_compiler,
+    needs_compiled_code,
     run_stages,
     some,
     without_stages,
 )
 
 Array = np.ndarray
-BACKENDS = [pytest.param("compiled", marks=needs_compiler), "numpy", "casadi"]
+BACKENDS = [pytest.param("compiled", marks=needs_compiled_code), "numpy", "casadi"]
 DRAWS = 1500
 EDGES = [
     (0, 1, "x", "high"),

@@ -16,11 +16,11 @@ from cnpgen.pipelines.stages.collision import (
 from cnpgen.pipelines.stages.stage import CandidateBatch
 from cnpgen.problems.constraints.clearance import ObjectContact, RobotClearance
 from cnpgen.world.world import World
-from tests.conftest import Prepare, needs_compiler, run_stages
+from tests.conftest import Prepare, needs_compiled_code, run_stages
 from tests.refusals import is_refused
 
 Array = np.ndarray
-BACKENDS = [pytest.param("compiled", marks=needs_compiler), "numpy", "casadi"]
+BACKENDS = [pytest.param("compiled", marks=needs_compiled_code), "numpy", "casadi"]
 RADIUS = 0.14
 
 

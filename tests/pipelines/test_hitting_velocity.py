@@ -8,7 +8,7 @@ import scipy
 
 from cnpgen.pipelines.stages.hitting_velocity import HittingVelocity, hitting_velocity
 from cnpgen.pipelines.stages.stage import CandidateBatch
-from tests.conftest import Arm, Prepare, needs_compiler, run_stages, some
+from tests.conftest import Arm, Prepare, needs_compiled_code, run_stages, some
 
 Array = np.ndarray
 HALF = np.sqrt(0.5)
@@ -23,7 +23,7 @@ AXES = [
         (HALF, -HALF),
     )
 ]
-BACKENDS = [pytest.param("compiled", marks=needs_compiler), "numpy", "casadi"]
+BACKENDS = [pytest.param("compiled", marks=needs_compiled_code), "numpy", "casadi"]
 
 
 def any_direction(random: np.random.Generator, count: int) -> list[Array]:

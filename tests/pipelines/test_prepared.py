@@ -18,7 +18,7 @@ from cnpgen.pipelines.stages.stage import BLOCK_ROWS, CandidateBatch
 from cnpgen.problems.constraints.link_clearance import ObjectClearance
 from cnpgen.store.field import Field
 from cnpgen.store.sampling_statistics import SamplingStatistics, merge_sampling
-from tests.conftest import SHIPPED, Prepare, needs_compiler, some
+from tests.conftest import SHIPPED, Prepare, needs_compiled_code, some
 
 CLOSE = 1e-9  # maximum difference of the backends, in SI units
 SEED = 20261121
@@ -309,7 +309,7 @@ def same_round(prepared: PreparedPipeline, size: int) -> CandidateBatch:
 @pytest.mark.parametrize("name", some(SHIPPED, 1, "slow"))
 @pytest.mark.parametrize(
     ("backend", "size"),
-    [pytest.param("compiled", 6000, marks=needs_compiler), ("numpy", 300)],
+    [pytest.param("compiled", 6000, marks=needs_compiled_code), ("numpy", 300)],
 )
 def test_backends_agree_on_the_same_candidates(prepare: Prepare, name, backend, size):
     """Exceptions are candidates close to a rejection limit and searches with two equal optima."""

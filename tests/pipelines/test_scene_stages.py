@@ -26,7 +26,7 @@ from cnpgen.robots.scene import make_scene_table, scene_capacity
 from cnpgen.robots.solid import place_obstacles, solids_of
 from cnpgen.store.scene_table import OBSTACLE_KINDS
 from cnpgen.world.pose_ik import PoseKinematics
-from tests.conftest import needs_compiler
+from tests.conftest import needs_compiled_code
 from tests.examples.numpy_observations import signed_distances
 from tests.examples.obstacles import draw_obstacle
 from tests.examples.scene_arm import obstacles_of, write_scene_pipeline
@@ -97,7 +97,7 @@ def test_depths_of_the_base_are_signed_distances() -> None:
     assert np.array_equal(depths > 0, inside)
 
 
-@needs_compiler
+@needs_compiled_code
 def test_candidates_share_scenes_evenly(pipeline: Pipeline, context: Context) -> None:
     candidates = drawn(pipeline, context, 64, stages=1)
     counts = np.bincount(candidates.scene)
@@ -106,7 +106,7 @@ def test_candidates_share_scenes_evenly(pipeline: Pipeline, context: Context) ->
     assert (candidates.scenes.table.obstacle_count >= 2).all()
 
 
-@needs_compiler
+@needs_compiled_code
 def test_scenes_with_too_many_obstacles_are_rejected(
     pipeline: Pipeline, context: Context
 ) -> None:
@@ -127,7 +127,7 @@ def test_scenes_with_too_many_obstacles_are_rejected(
         stage.prepare(context)
 
 
-@needs_compiler
+@needs_compiled_code
 def test_lines_collide_and_no_pair_occurs_twice(
     pipeline: Pipeline, context: Context
 ) -> None:
@@ -152,7 +152,7 @@ def test_lines_collide_and_no_pair_occurs_twice(
     assert len(pairs) == len(candidates.alive)
 
 
-@needs_compiler
+@needs_compiled_code
 def test_scenes_without_grasps_have_no_samples(
     pipeline: Pipeline, context: Context
 ) -> None:
@@ -165,7 +165,7 @@ def test_scenes_without_grasps_have_no_samples(
     assert candidates.reasons[-1] == NO_ENDS
 
 
-@needs_compiler
+@needs_compiled_code
 def test_coal_decides_like_compiled_checks(
     pipeline: Pipeline, context: Context
 ) -> None:
@@ -183,7 +183,7 @@ def test_coal_decides_like_compiled_checks(
     assert np.array_equal(clear, measured)
 
 
-@needs_compiler
+@needs_compiled_code
 def test_inverse_kinematics_reaches_poses(context: Context) -> None:
     robot, random = context.robot, np.random.default_rng(9)
     kinematics, loop = PoseKinematics(robot), Loop(POSE_TOLERANCE, MAX_POSE_IK_STEPS)

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from cnpgen.pipelines.stages.torque import GravityTorque, torque_ratio
-from tests.conftest import Arm, Prepare, needs_compiler, run_stages
+from tests.conftest import Arm, Prepare, needs_compiled_code, run_stages
 
-BACKENDS = [pytest.param("compiled", marks=needs_compiler), "numpy", "casadi"]
+BACKENDS = [pytest.param("compiled", marks=needs_compiled_code), "numpy", "casadi"]
 
 
 @pytest.mark.parametrize("backend", BACKENDS)

@@ -15,7 +15,7 @@ from cnpgen.planner.boundary_layer import BoundaryLayer
 from cnpgen.plans.format import BOUNDARY
 from cnpgen.robots.plausible_values import UnitError
 from cnpgen.trajectory.boundary import Boundary
-from tests.conftest import needs_compiler, some
+from tests.conftest import needs_compiled_code, some
 from tests.examples.plans_of_networks import (
     at_ends,
     boundary,
@@ -113,7 +113,7 @@ def test_gradients_of_outputs_are_those_of_central_differences(
         np.testing.assert_allclose(found, (ends[0] - ends[1]) / 2, rtol=1e-5, atol=1e-9)
 
 
-@needs_compiler
+@needs_compiled_code
 @pytest.mark.extended
 def test_compiled_and_interpreted_control_points_of_transports_agree(
     layers: dict[str, BoundaryLayer], cache_folder: Path
@@ -145,7 +145,7 @@ def test_compiled_and_interpreted_control_points_of_transports_agree(
 
 @pytest.mark.parametrize(
     "backend",
-    some([pytest.param("compiled", marks=needs_compiler), "numpy"], 1, "slow"),
+    some([pytest.param("compiled", marks=needs_compiled_code), "numpy"], 1, "slow"),
 )
 def test_an_overflowing_row_does_not_affect_other_rows(
     backend: Any, cache_folder: Path

@@ -16,7 +16,7 @@ from cnpgen.problems.problem_record import record_problem
 from cnpgen.robots.drive import DriveLine, DriveSpec
 from cnpgen.schema.keys import PerJoint
 from cnpgen.trajectory.spline_motion import Motion
-from tests.conftest import columns_of, needs_compiler
+from tests.conftest import columns_of, needs_compiled_code
 from tests.examples.models import (
     LoadedProblem,
     boundary_of_columns,
@@ -221,7 +221,7 @@ def test_motions_are_scaled_to_powers_and_not_time_parametrized(motion):
         assert power.max() == pytest.approx(1.0, abs=1e-6)
 
 
-@needs_compiler
+@needs_compiled_code
 @pytest.mark.slow
 def test_compiled_and_interpreted_time_parametrization_agree_with_drives(
     given, motion, time_parametrization

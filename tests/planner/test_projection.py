@@ -9,7 +9,7 @@ from cnpgen.planner.control_points import control_points, make_projection
 from cnpgen.planner.inference_pipeline import make_inference_pipeline
 from cnpgen.planner.tasks import ends_of, lanes, rows
 from cnpgen.trajectory.boundary import Boundary, anchor_line, assemble
-from tests.conftest import columns_of, needs_compiler, some
+from tests.conftest import columns_of, needs_compiled_code, some
 from tests.examples.models import (
     accelerated,
     boundary_of_columns,
@@ -153,7 +153,7 @@ def test_the_vjp_of_the_projection_agrees_with_finite_differences(tiny, name, fi
         )
 
 
-@needs_compiler
+@needs_compiled_code
 @pytest.mark.extended
 def test_compiled_and_interpreted_projections_of_transports_agree(tiny):
     path, obstacle_poses = nearby(tiny, "heavy-object", 3)

@@ -16,7 +16,7 @@ from cnpgen.problems.problem_file import load_problem
 from cnpgen.problems.problem_record import record_problem
 from cnpgen.scenes import make_scenes, plan_scenes
 from cnpgen.store.files.documents import plain
-from tests.conftest import needs_compiler, some
+from tests.conftest import needs_compiled_code, some
 from tests.examples.example_robots import SHIPPED, needs_robots, with_robots
 from tests.refusals import is_refused
 
@@ -82,7 +82,7 @@ def test_a_model_reaches_its_recorded_score(name, tiny):
 
 
 @needs_robots
-@needs_compiler
+@needs_compiled_code
 @pytest.mark.slow
 def test_the_planner_of_scenes_plans_in_unseen_scenes():
     scenes = make_scenes("tabletop", "panda-3kg", 25, seed=29_270_001)

@@ -17,7 +17,7 @@ from cnpgen.planner.time_parametrization import (
 from cnpgen.plans.evaluate import evaluate_plans
 from cnpgen.plans.plans import make_plans
 from cnpgen.trajectory.spline_motion import Motion
-from tests.conftest import columns_of, needs_compiler
+from tests.conftest import columns_of, needs_compiled_code
 from tests.examples.constraints import TipSpeed
 from tests.examples.jerk_limits import jerk_limited
 from tests.examples.models import (
@@ -152,7 +152,7 @@ def compiled_time_parametrization(
     )
 
 
-@needs_compiler
+@needs_compiled_code
 def test_compiled_and_interpreted_time_parametrization_agree(
     motion, time_parametrization
 ):
@@ -185,7 +185,7 @@ def test_compiled_and_interpreted_time_parametrization_agree(
     assert np.isnan(found[3]).all()
 
 
-@needs_compiler
+@needs_compiled_code
 def test_interpreted_kernels_are_called_from_compiled_code(given, motion):
     compiled = compiled_time_parametrization("airhockey")
     kernels = interpreted(given).kernels
@@ -198,7 +198,7 @@ def test_interpreted_kernels_are_called_from_compiled_code(given, motion):
     )
 
 
-@needs_compiler
+@needs_compiled_code
 @pytest.mark.slow
 def test_compiled_and_interpreted_time_parametrization_agree_from_rest_to_rest(tiny):
     """Only with obstacles a state has more values than the motion; compiling its kernels takes some seconds."""

@@ -20,7 +20,7 @@ from cnpgen.plans.evaluate import evaluate_plans
 from cnpgen.trajectory.boundary import Boundary
 from cnpgen.trajectory.spline_motion import Motion
 from cnpgen.world.world import World
-from tests.conftest import needs_compiler
+from tests.conftest import needs_compiled_code
 from tests.examples.models import quickest
 from tests.examples.plans import PROBLEMS, ROBOTS, load
 
@@ -136,7 +136,7 @@ def test_the_best_lines_have_the_smallest_violations(checks: ViaPoints) -> None:
 
 
 @pytest.mark.slow  # it compiles for a minute
-@needs_compiler
+@needs_compiled_code
 def test_via_points_repair_plans_and_keep_those_without_violation(
     model: Model, problems: Boundary
 ) -> None:
@@ -172,7 +172,7 @@ def test_via_points_repair_plans_and_keep_those_without_violation(
     assert not evaluate_plans(straight[certain], workers=1).valid.any()
 
 
-@needs_compiler
+@needs_compiled_code
 @pytest.mark.slow  # it compiles for a minute
 def test_a_line_through_a_via_point_passes_near_it_and_keeps_its_ends(
     model: Model, problems: Boundary

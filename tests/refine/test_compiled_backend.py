@@ -21,14 +21,14 @@ from cnpgen.refine.task import RefinementTask
 from cnpgen.robots.scene import Scene
 from cnpgen.trajectory.boundary import Boundary
 from cnpgen.trajectory.trajectory_spec import TrajectorySpec
-from tests.conftest import some
+from tests.conftest import needs_compiled_code, some
 from tests.examples import numpy_solver
 from tests.examples.chains import chain
 from tests.examples.numpy_solver import NumpyBackend
 from tests.examples.plans import Plan, load
-from tests.examples.refiner import library, needs_compiler, task
+from tests.examples.refiner import library, task
 
-pytestmark = needs_compiler
+pytestmark = needs_compiled_code
 LABELS = ("hit", "replan", "transport")
 
 

@@ -24,7 +24,7 @@ from cnpgen.refine.task import MAX_JUDGED_VIOLATION, Outcome
 from cnpgen.robots.solid import place_obstacles
 from cnpgen.trajectory.spline_motion import Motion
 from cnpgen.world.world import World
-from tests.conftest import needs_compiler
+from tests.conftest import needs_compiled_code
 from tests.examples.coal_hulls import CoalHulls, compiled_hulls
 from tests.examples.meshes import Meshes
 from tests.examples.narrow import (
@@ -70,7 +70,7 @@ def clear_states(hulls, q: np.ndarray, poses: np.ndarray):
     )
 
 
-@needs_compiler
+@needs_compiled_code
 def test_distances_agree_with_meshes(tmp_path, make_hulls):
     problem = load_problem(write_problem(tmp_path))
     robot = load_robot(problem)
@@ -93,7 +93,7 @@ def test_distances_agree_with_meshes(tmp_path, make_hulls):
     assert allowed == pytest.approx(-found.min() - 1e-4, abs=1e-9)
 
 
-@needs_compiler
+@needs_compiled_code
 def test_distances_of_positions_that_are_not_finite_are_nan(tmp_path, make_hulls):
     problem = load_problem(write_problem(tmp_path))
     robot = load_robot(problem)
@@ -103,7 +103,7 @@ def test_distances_of_positions_that_are_not_finite_are_nan(tmp_path, make_hulls
     ).all()
 
 
-@needs_compiler
+@needs_compiled_code
 @pytest.mark.parametrize("obstacles", [KINDS, OBSTACLES], ids=["kinds", "boxes"])
 def test_compiled_rows_are_the_distances_of_hulls_and_their_gradients(
     tmp_path, obstacles
@@ -182,7 +182,7 @@ tolerance = 1e-3
 """
 
 
-@needs_compiler
+@needs_compiled_code
 @pytest.mark.parametrize("obstacles", [KINDS, OBSTACLES], ids=["kinds", "boxes"])
 def test_distances_of_the_held_object_are_those_of_the_verdict(
     tmp_path, obstacles, make_hulls
@@ -235,7 +235,7 @@ def test_distances_of_the_held_object_are_those_of_the_verdict(
     np.testing.assert_array_equal(clear, clear_states(links, q, poses) & free)
 
 
-@needs_compiler
+@needs_compiled_code
 def test_an_end_within_the_tolerance_of_a_contact_is_accepted(tmp_path):
     """Both ends hold the object 3 mm deep in a table, where 0 mm are legal and 5 mm accepted."""
     table = BOXES.format(
@@ -268,7 +268,7 @@ def test_an_end_within_the_tolerance_of_a_contact_is_accepted(tmp_path):
     assert accepted.max() == pytest.approx(0.003, abs=1e-6)
 
 
-@needs_compiler
+@needs_compiled_code
 def test_rows_of_distances_follow_those_of_interpreted_kernels(tmp_path):
     problem = load_problem(write_problem(tmp_path, obstacles=KINDS))
     robot, poses = load_robot(problem), place_obstacles(problem.obstacle)
@@ -286,7 +286,7 @@ def test_rows_of_distances_follow_those_of_interpreted_kernels(tmp_path):
         np.testing.assert_allclose(found, expected, rtol=1e-9, atol=1e-9)
 
 
-@needs_compiler
+@needs_compiled_code
 def test_compiled_rows_of_the_held_object_have_its_depth(tmp_path):
     problem = load_problem(write_problem(tmp_path, more=HELD))
     robot = load_robot(problem)
@@ -306,7 +306,7 @@ def test_compiled_rows_of_the_held_object_have_its_depth(tmp_path):
     np.testing.assert_allclose(limited, distances, atol=1e-4)
 
 
-@needs_compiler
+@needs_compiled_code
 @pytest.mark.parametrize(
     "more",
     [
@@ -329,7 +329,7 @@ def test_scenes_of_a_robot_share_kernels(tmp_path, more):
     assert tapes[0].to_bytes() == tapes[1].to_bytes()
 
 
-@needs_compiler
+@needs_compiled_code
 def test_collisions_between_grid_points_require_more_clearance(tmp_path):
     problem = narrow(tmp_path, WALL)
     tool, task = Refiner(problem, load_robot(problem)), between(problem, BESIDE_WALL)
@@ -347,7 +347,7 @@ def test_collisions_between_grid_points_require_more_clearance(tmp_path):
     assert missing.max() > 0.02
 
 
-@needs_compiler
+@needs_compiled_code
 def test_a_collision_of_the_verdict_becomes_larger_distances_around_its_phase(tmp_path):
     problem = narrow(tmp_path, WALL)
     tool, task = Refiner(problem, load_robot(problem)), between(problem, BESIDE_WALL)
@@ -362,7 +362,7 @@ def test_a_collision_of_the_verdict_becomes_larger_distances_around_its_phase(tm
     assert (extra[3][collides] > 0.003).all()
 
 
-@needs_compiler
+@needs_compiled_code
 def test_motions_through_a_wall_between_grid_points_are_continued_on_the_fine_level(tmp_path, monkeypatch):  # fmt: skip
     problem = narrow(tmp_path, WALL)
     tool, task = refiner(problem), between(problem, BESIDE_WALL)
@@ -462,7 +462,7 @@ def test_large_trees_follow_the_first_ones(monkeypatch):
 
 
 @pytest.mark.slow
-@needs_compiler
+@needs_compiled_code
 def test_a_problem_without_a_path_reports_it(tmp_path, monkeypatch):
     problem = narrow(tmp_path, WALL)
     tool, task = refiner(problem), between(problem, BESIDE_WALL)
@@ -476,7 +476,7 @@ def test_a_problem_without_a_path_reports_it(tmp_path, monkeypatch):
 
 
 @pytest.mark.slow
-@needs_compiler
+@needs_compiled_code
 def test_no_path_is_searched_if_an_end_is_inside_an_obstacle(tmp_path, monkeypatch):
     problem = narrow(tmp_path, SLOT)
     tool, inside = (
@@ -503,7 +503,7 @@ def test_robots_without_a_shape_have_no_hulls(tmp_path):
 
 
 @pytest.mark.slow
-@needs_compiler
+@needs_compiled_code
 @pytest.mark.parametrize("compiled", [True, False])
 def test_a_slot_that_is_too_narrow_for_capsules_is_wide_enough_for_hulls(
     tmp_path, compiled, monkeypatch
@@ -535,7 +535,7 @@ def test_a_slot_that_is_too_narrow_for_capsules_is_wide_enough_for_hulls(
     )  # the tolerance of the problem
 
 
-@needs_compiler
+@needs_compiled_code
 def test_a_contact_of_an_end_does_not_prolong_the_search(tmp_path, monkeypatch):
     """The start is closer to the roof than required, within the tolerance: every motion has this contact."""
     problem = narrow(tmp_path, SLOT)
@@ -567,7 +567,7 @@ def test_a_contact_of_an_end_does_not_prolong_the_search(tmp_path, monkeypatch):
 
 
 @pytest.mark.slow
-@needs_compiler
+@needs_compiled_code
 def test_a_contact_within_the_tolerance_is_removed(tmp_path):
     """A plan approaches an obstacle half way; the required distance is larger by half the tolerance."""
     problem = narrow(tmp_path, SLOT)

@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 from numpy_transcription import evaluate, regularized_values, residual_gradients
 
-from cnpgen.kernels.compiler import find_compiler
 from cnpgen.kernels.library import default_cache_folder, problem_kernels
 from cnpgen.refine.fine_check import FineCheck
 from cnpgen.refine.options import RefineOptions
@@ -25,9 +24,8 @@ from tests.examples.refiner import obstacle_poses, refine, task, verdict
 @cache
 def jerk_limited_refiner(name: str) -> Refiner:
     problem, robot = jerk_limited(name)
-    backend = (
-        "compiled" if find_compiler() and name == "airhockey" else "numpy"
-    )  # the other problem needs few evaluations
+    # The other problem needs few evaluations.
+    backend = "compiled" if name == "airhockey" else "numpy"
     kernels = problem_kernels(problem, robot, backend, default_cache_folder())
     return Refiner(problem, robot, kernels=kernels, options=RefineOptions(weight=0.0))
 

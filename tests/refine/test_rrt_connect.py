@@ -11,11 +11,11 @@ from cnpgen.refine.strategy import PlanChecker, refine_task
 from cnpgen.refine.task import Outcome
 from cnpgen.trajectory.boundary import assemble
 from cnpgen.trajectory.spline_motion import Motion
-from tests.conftest import needs_compiler
+from tests.conftest import needs_compiled_code
 from tests.examples.meshes import Meshes
 from tests.examples.narrow import BESIDE_WALL, WALL, between, narrow, refiner
 
-pytestmark = needs_compiler
+pytestmark = needs_compiled_code
 
 
 @pytest.fixture(scope="module")

@@ -16,12 +16,12 @@ from cnpgen.plans import Plans
 from cnpgen.problems.load_robot import load_robot
 from cnpgen.problems.problem_file import load_problem
 from cnpgen.trajectory.spline_motion import Motion
-from tests.conftest import needs_compiler, some
+from tests.conftest import needs_compiled_code, some
 from tests.examples.example_robots import CLUTTER, folder, needs_robots, write_panda
 from tests.examples.meshes import Meshes, states
 from tests.examples.shaped_robot import KINDS, OBSTACLES, write_pipeline, write_problem
 
-pytestmark = needs_compiler
+pytestmark = needs_compiled_code
 
 
 def solved(where: Path, n: int) -> Plans:

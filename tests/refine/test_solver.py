@@ -52,7 +52,7 @@ from cnpgen.trajectory.spline import chebyshev
 from cnpgen.trajectory.spline_motion import Motion
 from cnpgen.trajectory.trajectory_spec import TrajectorySpec
 from cnpgen.world.world import World
-from tests.conftest import some
+from tests.conftest import needs_compiled_code, some
 from tests.examples import numpy_solver
 from tests.examples.constraints import TipSpeed
 from tests.examples.numpy_solver import NumpyBackend
@@ -60,7 +60,6 @@ from tests.examples.plans import PROBLEMS, Plan, load, raised
 from tests.examples.refiner import (
     cost_term_of,
     library,
-    needs_compiler,
     obstacle_poses,
     refine,
     refiner,
@@ -606,7 +605,7 @@ class CountingChecker(PlanChecker):
 
 @pytest.mark.parametrize("radius", [0.02, 0.3])
 @pytest.mark.parametrize(
-    "kind", [NumpyBackend, pytest.param(CompiledBackend, marks=needs_compiler)]
+    "kind", [NumpyBackend, pytest.param(CompiledBackend, marks=needs_compiled_code)]
 )
 def test_the_solution_of_a_subproblem_meets_the_optimality_conditions(
     kind: type[NumpyBackend | CompiledBackend],
@@ -762,7 +761,7 @@ def n_solved_fine(refinement: Refinement) -> int:
     return sum(result.outcome is Outcome.SOLVED_FINE for result in refinement.results)
 
 
-@needs_compiler
+@needs_compiled_code
 def test_violations_between_points_are_corrected_on_the_same_level(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
@@ -807,7 +806,7 @@ def test_relaxed_bounds_at_an_end_reduce_the_interval_tolerance() -> None:
     )
 
 
-@needs_compiler
+@needs_compiled_code
 def test_stalled_iterations_become_feasible_on_the_same_level(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
@@ -821,7 +820,7 @@ def test_stalled_iterations_become_feasible_on_the_same_level(
     assert fine[sqp.MAX_RESTORED_VIOLATION] < fine[0.0]
 
 
-@needs_compiler
+@needs_compiled_code
 def test_first_steps_from_a_plan_select_accelerations_far_from_their_limits() -> None:
     plans = Planner("airhockey-replan").plan_batch(
         draw_boundary_problems("airhockey-replan", 40, seed=8).boundary
@@ -861,7 +860,7 @@ def remaining_plans(min_duration: float, max_duration: float) -> Plans:
     return found
 
 
-@needs_compiler
+@needs_compiled_code
 def test_motions_of_hundredths_of_a_second_become_feasible_in_few_steps(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
@@ -887,7 +886,7 @@ class FewSteps(Deadline):
         self.steps_left -= 1
 
 
-@needs_compiler
+@needs_compiled_code
 def test_before_a_deadline_motions_of_hundredths_of_a_second_become_feasible_too(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:

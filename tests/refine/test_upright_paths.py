@@ -16,9 +16,9 @@ from cnpgen.refine.refine_engine import prepare, tasks_of
 from cnpgen.refine.rrt_connect import MANIFOLD_SPACING_RAD, TreeSearch
 from cnpgen.refine.task import Outcome
 from cnpgen.world.world import World
-from tests.conftest import needs_compiler
+from tests.conftest import needs_compiled_code
 
-pytestmark = needs_compiler
+pytestmark = needs_compiled_code
 
 ENDS = json.loads((Path(__file__).parents[1] / "data" / "transports.json").read_text())
 UNSOLVED = [

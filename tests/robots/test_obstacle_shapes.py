@@ -32,7 +32,7 @@ from cnpgen.robots.observation.observations import DistanceGrid, SurfaceCloud
 from cnpgen.robots.solid import place_obstacles, solids_of
 from cnpgen.schema.entry_points import entry_points
 from cnpgen.world.collision_world import CollisionWorld
-from tests.conftest import needs_compiler
+from tests.conftest import needs_compiled_code
 from tests.examples.capped_cone import (
     NAME,
     ROUNDER,
@@ -101,7 +101,7 @@ def test_solvers_have_a_lower_bound_with_the_sign_of_the_distance(
     assert (found[~outside] < 1e-6).all()
 
 
-@needs_compiler
+@needs_compiled_code
 def test_compiled_clearances_agree_with_coal(problem: Problem, tmp_path: Path) -> None:
     robot = load_robot(problem)
     q = np.random.default_rng(1).uniform(
@@ -119,7 +119,7 @@ def test_compiled_clearances_agree_with_coal(problem: Problem, tmp_path: Path) -
     assert (compiled[near] >= expected[near] - slack(problem) - 1e-4).all()
 
 
-@needs_compiler
+@needs_compiled_code
 def test_observations_and_views_show_the_cone(problem: Problem) -> None:
     (obstacle,) = problem.obstacle
     low, high = (0.1, -0.2, 0.0), (0.8, 0.4, 0.5)
@@ -141,7 +141,7 @@ def test_observations_and_views_show_the_cone(problem: Problem) -> None:
     assert len(solid.corners) > MAX_ROUND_CORNERS  # a mesh in simulators
 
 
-@needs_compiler
+@needs_compiled_code
 def test_plans_avoid_the_cone_and_need_its_package(
     tmp_path: Path, problem: Problem
 ) -> None:

@@ -45,7 +45,7 @@ from cnpgen.training.train import train_model
 from cnpgen.training.training_options import TrainingOptions
 from cnpgen.trajectory.spline import clamped_knots
 from cnpgen.world.forward_kinematics import ForwardKinematics
-from tests.conftest import needs_compiler
+from tests.conftest import needs_compiled_code
 from tests.examples.numpy_observations import signed_distances
 from tests.examples.shaped_robot import WEDGE, write_problem
 from tests.refusals import is_refused
@@ -236,7 +236,7 @@ def test_control_points_stay_within_the_limits(problem):
     )
 
 
-@needs_compiler
+@needs_compiled_code
 def test_the_gradient_is_the_sum_of_those_of_all_iterations(problem):
     rows = make_scene_rows(problem, scenes(problem, 60), "here")
     settings = replace(TINY, iterations=3)
@@ -278,7 +278,7 @@ def test_the_gradient_is_the_sum_of_those_of_all_iterations(problem):
     )
 
 
-@needs_compiler
+@needs_compiled_code
 @pytest.mark.slow
 def test_a_planner_is_trained_on_a_scene_file_and_plans_its_scenes(
     problem, tmp_path, capsys

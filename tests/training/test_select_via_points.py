@@ -10,7 +10,7 @@ from cnpgen.make.draw_boundary_problems import draw_boundary_problems
 from cnpgen.planner.model_file import load_model
 from cnpgen.planner.planner import Planner
 from cnpgen.training import select_via_points as via_points
-from tests.conftest import needs_compiler
+from tests.conftest import needs_compiled_code
 from tests.refusals import is_refused
 
 
@@ -26,7 +26,7 @@ def test_the_greedy_cover_selects_the_row_with_most_remaining_columns() -> None:
 
 
 @pytest.mark.slow  # it compiles for a minute
-@needs_compiler
+@needs_compiled_code
 def test_selected_via_points_repair_plans_of_other_problems(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:

@@ -21,7 +21,14 @@ from cnpgen.store.dataset_spec import load_dataset_spec, shards
 from cnpgen.store.layout import MANIFEST
 from cnpgen.store.shard import read_shard
 from cnpgen.validate.validate_dataset import ValidationReport, validate_dataset
-from tests.conftest import SHIPPED, TINY_SHARD, Arm, needs_compiler, some, tiny_recipe
+from tests.conftest import (
+    SHIPPED,
+    TINY_SHARD,
+    Arm,
+    needs_compiled_code,
+    some,
+    tiny_recipe,
+)
 from tests.examples.forged_shards import edit
 from tests.refusals import is_refused
 
@@ -454,7 +461,7 @@ def test_blocks_are_regenerated_with_the_backend_of_the_specification(tmp_path):
 
 
 @pytest.mark.slow
-@needs_compiler
+@needs_compiled_code
 def test_blocks_of_compiled_kernels_need_no_compiler(
     tiny: Tiny, monkeypatch, fresh_compiler
 ):

@@ -39,7 +39,7 @@ from cnpgen.scenes import (
     observe,
     scene_bodies,
 )
-from tests.conftest import needs_compiler
+from tests.conftest import needs_compiled_code
 from tests.examples.numpy_observations import (
     NumpyObservations,
     bodies_of,
@@ -102,7 +102,7 @@ def scenes() -> list[tuple[Obstacle, ...]]:
     ]
 
 
-@needs_compiler
+@needs_compiled_code
 @pytest.mark.parametrize("kind", SMALL, ids=lambda kind: kind.name)
 def test_compiled_observations_equal_the_numpy_reference(kind: Observation) -> None:
     compiled, bodies = observe(scenes(), kind, seed=5), scene_bodies(scenes())
@@ -207,7 +207,7 @@ def test_a_camera_sees_the_nearest_surface_only() -> None:
     )
 
 
-@needs_compiler
+@needs_compiled_code
 @pytest.mark.parametrize(
     "make_backend", [observation_backend, NumpyObservations], ids=["compiled", "numpy"]
 )

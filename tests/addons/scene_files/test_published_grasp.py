@@ -11,7 +11,7 @@ import cnpgen
 from cnpgen.problems.load_robot import load_robot
 from cnpgen.robots.solid import place_obstacles
 from cnpgen.scenes import load_scenes, solve_scenes
-from tests.conftest import needs_compiler
+from tests.conftest import needs_compiled_code
 from tests.examples.coal_hulls import CoalHulls
 from tests.examples.example_robots import needs_robots
 
@@ -44,7 +44,7 @@ def penetration(name: str, scene: cnpgen.scenes.SceneProblem) -> float:
 
 
 @pytest.mark.slow
-@needs_compiler
+@needs_compiled_code
 def test_the_open_gripper_reaches_a_published_grasp(tmp_path):
     path = tmp_path / "scenes.yaml"
     path.write_text(SCENE)

@@ -24,7 +24,7 @@ from cnpgen.robots.shape.convex_part import turned
 from cnpgen.scenes import SceneError, load_scenes, save_scenes, solve_scenes
 from tests.addons.scene_files.moveit_messages import document
 from tests.addons.scene_files.test_moveit_unused import OTHER, changed, minimal
-from tests.conftest import needs_compiler
+from tests.conftest import needs_compiled_code
 from tests.examples.example_robots import needs_robots
 from tests.refusals import is_refused
 
@@ -565,7 +565,7 @@ def test_padding_and_scale_enlarge_links_for_obstacles_only(tmp_path, robot):
 
 
 @pytest.mark.slow
-@needs_compiler
+@needs_compiled_code
 def test_a_padded_link_keeps_its_distance_from_obstacles(tmp_path, robot):
     corners = next(
         part.vertices for part in robot.shape.convex_parts if part.link == "panda_hand"
@@ -593,7 +593,7 @@ def test_a_padded_link_keeps_its_distance_from_obstacles(tmp_path, robot):
 
 
 @pytest.mark.slow
-@needs_compiler
+@needs_compiled_code
 def test_an_allowed_collision_of_an_object_and_links_holds_for_these_links(
     tmp_path, robot
 ):
@@ -620,7 +620,7 @@ def test_an_allowed_collision_of_an_object_and_links_holds_for_these_links(
 
 
 @pytest.mark.slow
-@needs_compiler
+@needs_compiled_code
 def test_the_velocity_scaling_of_a_request_holds(tmp_path, robot):
     content = request(
         max_velocity_scaling_factor=0.1, max_acceleration_scaling_factor=0.1
@@ -632,7 +632,7 @@ def test_the_velocity_scaling_of_a_request_holds(tmp_path, robot):
 
 
 @pytest.mark.slow
-@needs_compiler
+@needs_compiled_code
 def test_the_plan_begins_with_the_velocity_of_the_request(tmp_path):
     state = copy.deepcopy(request()["start_state"])
     state["joint_state"]["velocity"] = [0.5] * 7
@@ -642,7 +642,7 @@ def test_the_plan_begins_with_the_velocity_of_the_request(tmp_path):
 
 
 @pytest.mark.slow
-@needs_compiler
+@needs_compiled_code
 def test_an_attached_object_avoids_the_obstacles(tmp_path, robot):
     hand = pose_of(robot, "panda_hand", [0, *START[1:]])
     tip = hand.act(np.array([0, 0, 0.4]))
@@ -740,7 +740,7 @@ def document_for_panda() -> dict[str, Any]:
 
 
 @pytest.mark.slow
-@needs_compiler
+@needs_compiled_code
 def test_elements_that_are_not_used_do_not_change_plans_and_verdicts(tmp_path):
     usual = other = document_for_panda()
     for place, value in OTHER.values():
