@@ -22,6 +22,8 @@ if TYPE_CHECKING:
 
 _SHARES = (0.1, 0.9, 10.0)  # fractions of the limits
 _MIXED = np.cos(np.arange(64.0))  # both signs and distinct magnitudes
+# (structure of a problem, form, whether jerks count) -> result of ``condition_orders``.
+_ORDERS: dict[tuple[str, str, bool], list[int]] = {}
 
 
 def symbolic_needs(condition: Condition, *derivatives: Any) -> int:
@@ -74,6 +76,28 @@ def measured_needs(
         max(order for order, yes in enumerate((True, *each)) if yes)
         for each in zip(*changed, strict=True)
     ]
+
+
+def condition_orders(
+    problem: Problem, world: "World", form: str, *, jerk: bool = False
+) -> list[int]:
+    """Return the derivative orders of the conditions of a problem, in the form "solved" or "judged".
+
+    Problems that differ only in poses and sizes of obstacles share the result, see
+    ``measured_needs``. The world is left at rest in the base configuration.
+    """
+    structure = problem.structure
+    key = None if structure is None else (structure, form, jerk)
+    if key not in _ORDERS:
+        forms = [getattr(constraint, form) for constraint in problem.constraint]
+        orders = measured_needs(forms, world, jerk=jerk)
+        if key is None:
+            return orders
+        _ORDERS[key] = orders
+    rest = [np.zeros(world.robot.n)] * (3 if jerk else 2)
+    poses = place_obstacles(world.obstacles)
+    world.set_state(world.robot.home, rest[0], rest[1], poses, *rest[2:])
+    return _ORDERS[key]
 
 
 def _changed(

@@ -14,7 +14,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from cnpgen.arrays import Array
-from cnpgen.problems.conditions import measured_needs
+from cnpgen.problems.conditions import condition_orders
 from cnpgen.problems.constraints.constraint import Condition, Constraint
 from cnpgen.problems.constraints.joint import (
     POWER_UNIT,
@@ -48,8 +48,7 @@ class EndCheck:
         self._problem = problem
         self._world = World(robot, problem.obstacle, problem.object_size)
         self._torque = problem.first(JointTorque)
-        measured = [constraint.judged for constraint in problem.constraint]
-        self._orders = measured_needs(measured, self._world)
+        self._orders = condition_orders(problem, self._world, "judged")
 
     def violations(
         self, boundary: Boundary, scene: Scene

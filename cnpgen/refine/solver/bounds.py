@@ -16,14 +16,13 @@ from itertools import accumulate
 import numpy as np
 
 from cnpgen.arrays import Array, Mask
-from cnpgen.problems.conditions import measured_needs
+from cnpgen.problems.conditions import condition_orders
 from cnpgen.problems.constraints.clearance import RobotClearance
 from cnpgen.problems.constraints.constraint import Condition, Constraint
 from cnpgen.problems.constraints.joint import JointPosition
 from cnpgen.problems.constraints.link_clearance import ObjectClearance, SelfClearance
 from cnpgen.problems.problem import Problem
 from cnpgen.refine.solver.residuals import DISTANCE_SCALE_M, residual_scale
-from cnpgen.robots.solid import place_obstacles
 from cnpgen.world.world import World
 
 # From either end, whose accelerations depend on the last rate control points.
@@ -44,8 +43,6 @@ NEAR_FRACTION = 0.97
 INTERVAL_FRACTION = 0.9
 
 
-# Structure of a problem -> result of ``condition_orders``.
-_ORDERS: dict[str, list[int]] = {}
 _TEMPLATES: dict[tuple[str, bytes, "Tightening"], "BoundsTemplate"] = {}
 MAX_TEMPLATES = 64
 
@@ -133,29 +130,6 @@ class Bounds:
         return Bounds(lower, upper, self.nonsmooth, self.interval_tolerance)
 
 
-def condition_orders(problem: Problem, world: World) -> list[int]:
-    """Return the highest derivative of q on which each condition depends; the world is left at rest.
-
-    Problems that differ only in poses and sizes of obstacles share the result.
-    """
-    forms = [constraint.solved for constraint in problem.constraint]
-    structure = problem.structure
-    rest = [np.zeros(world.robot.n)] * (3 if problem.uses_jerk else 2)
-    if structure is not None and structure in _ORDERS:
-        world.set_state(
-            world.robot.home,
-            rest[0],
-            rest[1],
-            place_obstacles(world.obstacles),
-            *rest[2:],
-        )
-        return _ORDERS[structure]
-    orders = measured_needs(forms, world, jerk=problem.uses_jerk)
-    if structure is not None:
-        _ORDERS[structure] = orders
-    return orders
-
-
 def bounds_template(
     problem: Problem, world: World, s: Array, tightening: Tightening
 ) -> "BoundsTemplate":
@@ -183,7 +157,7 @@ class BoundsTemplate:
     def __init__(
         self, problem: Problem, world: World, s: Array, tightening: Tightening
     ) -> None:
-        orders = condition_orders(problem, world)
+        orders = condition_orders(problem, world, "solved", jerk=problem.uses_jerk)
         pairs = [
             (constraint, condition)
             for constraint in problem.constraint
