@@ -46,6 +46,7 @@ from cnpgen.robots.urdf_changes import (
     with_locked_joints,
     with_payload_link,
     with_point_masses,
+    without_disabled_pairs,
 )
 from cnpgen.robots.urdf_elements import check_elements, check_names
 from cnpgen.schema import registry
@@ -425,13 +426,7 @@ class Problem:
             return self.same_robot.urdf_text
         spec = self.robot
         positions = dict(zip(spec.locked_joints, spec.locked_positions, strict=True))
-        text = read_urdf(self.urdf_path)
-        if not self.is_stored:
-            # The reader of the robot raises errors about the text itself.
-            with suppress(ValueError):
-                tree = urdf_tree(text)
-                check_elements(tree, self.urdf_path, allow_unused=spec.allow_unused)
-                check_names(tree, self.urdf_path)
+        text = self._checked_urdf()
         text = with_locked_joints(text, positions, is_stored=self.is_stored)
         text = with_point_masses(text)
         # Meshes need not exist where no constraint uses the geometry.
@@ -455,6 +450,19 @@ class Problem:
                 text, srdf, planned=spec.joints, allow_unused=spec.allow_unused
             )
         return self._with_payload(text)
+
+    def _checked_urdf(self) -> str:
+        """Return the text of the file, whose elements are checked unless the problem is stored."""
+        text = read_urdf(self.urdf_path)
+        if not self.is_stored:
+            # The reader of the robot raises errors about the text itself.
+            with suppress(ValueError):
+                tree = urdf_tree(text)
+                allowed = self.robot.allow_unused
+                check_elements(tree, self.urdf_path, allow_unused=allowed)
+                check_names(tree, self.urdf_path)
+                return without_disabled_pairs(text)
+        return text
 
     def _with_payload(self, text: str) -> str:
         """Return a URDF with the box of a payload that is a body, and with the ignored pairs."""

@@ -83,15 +83,20 @@ def joint_notes(
         if given := [each.name for each in joints if rate in each.rates]:
             yield f"the URDF limits the {rate} of {', '.join(given)}; a value in [limits] replaces it"
     # A reflected inertia J = ratio^2 * J_rotor needs both factors.
-    reduced = {
-        joint.get("name", "")
-        for transmission in tree.findall("transmission")
-        for joint in transmission.findall("joint")
-        if transmission.find(".//mechanicalReduction") is not None
-    }
-    if found := [each.name for each in joints if each.name in reduced]:
-        text = "a gear ratio without a rotor inertia has no effect, and is not used"
-        yield f"<transmission> of {', '.join(found)}: {text}"
+    parts = {"mechanicalReduction": "gear_ratio", "motorInertia": "rotor_inertia"}
+    reduced: dict[str, list[str]] = {}
+    for transmission in tree.findall("transmission"):
+        found = [
+            f"<{tag}>" for tag in parts if transmission.find(f".//{tag}") is not None
+        ]
+        for joint in transmission.findall("joint"):
+            if found and joint.get("name") in {each.name for each in joints}:
+                reduced.setdefault(" and ".join(found), []).append(
+                    joint.get("name", "")
+                )
+    keys = " and ".join(parts.values())
+    for text, names in reduced.items():
+        yield f"not used of the <transmission> of {', '.join(names)}: {text}; {keys} of [drive] state both"
 
 
 def _controller_notes(

@@ -12,26 +12,19 @@ from cnpgen.errors import RecipeError, counted, listed, nearest
 from cnpgen.robots.robot_spec import Payload, RobotSpec
 from cnpgen.robots.shape.convex_part import turned
 from cnpgen.robots.urdf import number_in, numbers_in, numbers_text, read_urdf, urdf_tree
-from cnpgen.robots.urdf_elements import check_elements
+from cnpgen.robots.urdf_elements import (
+    DISABLED,
+    NO_DEFAULT,
+    PAIR,
+    SRDF_NAMES,
+    check_elements,
+)
 from cnpgen.robots.urdf_parameters import placement_of
 
 _TURNING = ("revolute", "continuous")
 _SLIDING = ("prismatic",)
 # Elements of a joint that moves.
 _MOTION = "axis", "limit", "mimic", "calibration", "dynamics", "safety_controller"
-_TAG = "disable_collisions"
-_PAIR = ("link1", "link2")
-_NO_DEFAULT = "disable_default_collisions"
-# The problem names the planned joints, the tip and the placement of the base; pairs are
-# checked unless they are disabled, which takes precedence over <enable_collisions>.
-SRDF_NAMES = {
-    "robot": (
-        *("name", "version", _TAG, _NO_DEFAULT, "group", "group_state"),
-        *("end_effector", "virtual_joint", "passive_joint", "joint_property"),
-        *("link_sphere_approximation", "enable_collisions"),
-    ),
-    _TAG: (*_PAIR, "reason"),
-}
 PAYLOAD = "carried payload"  # name of the link and of its joint
 
 _LOG = logging.getLogger(__name__)
@@ -214,6 +207,17 @@ def _turn(axis: np.ndarray, angle: float) -> np.ndarray:
     )
 
 
+def without_disabled_pairs(urdf: str) -> str:
+    """Return a URDF without the link pairs that it disables: only an SRDF, or the problem, does so."""
+    robot = urdf_tree(urdf)
+    if not (entries := robot.findall(f".//{DISABLED}/..")):
+        return urdf
+    for parent in entries:
+        for entry in parent.findall(DISABLED):
+            parent.remove(entry)
+    return ElementTree.tostring(robot, encoding="unicode")
+
+
 def with_disabled_pairs(
     urdf: str,
     srdf: Path,
@@ -234,16 +238,20 @@ def with_disabled_pairs(
         raise RecipeError([f"{srdf}: not an SRDF that can be read: {error}"]) from error
     if tree.find("link") is not None:
         raise RecipeError(
-            [f"{srdf}: is a URDF, expected an SRDF with <{_TAG}> elements"]
+            [f"{srdf}: is a URDF, expected an SRDF with <{DISABLED}> elements"]
         )
     _account_srdf(tree, srdf, allow_unused)
     passive = {each.get("name", "") for each in tree.iter("passive_joint")}
     if moved := sorted(passive.intersection(planned)):
         text = f"<passive_joint> names the planned joint {moved[0]!r}"
         raise RecipeError([f"{srdf}: {text}: no motor moves it, remove one of both"])
-    entries = [dict(entry.attrib) for entry in tree.iter(_TAG)]
-    links = {link.get("name", "") for link in urdf_tree(urdf).iter("link")}
-    named = {entry[key] for entry in entries for key in _PAIR if key in entry}
+    entries = [dict(entry.attrib) for entry in tree.iter(DISABLED)]
+    robot = urdf_tree(urdf)
+    names = tree.get("name", ""), robot.get("name", "")
+    if all(names) and names[0] != names[1]:
+        _LOG.warning("%s is of the robot %r, the URDF of %r", srdf, *names)
+    links = {link.get("name", "") for link in robot.iter("link")}
+    named = {entry[key] for entry in entries for key in PAIR if key in entry}
     if unknown := sorted(named - links):
         count = counted(len(unknown), "link")
         _LOG.warning(
@@ -252,7 +260,7 @@ def with_disabled_pairs(
     known = [
         entry
         for entry in entries
-        if not {entry.get(key, "") for key in _PAIR} & set(unknown)
+        if not {entry.get(key, "") for key in PAIR} & set(unknown)
     ]
     return _with_entries(urdf, known, str(srdf))
 
@@ -260,10 +268,10 @@ def with_disabled_pairs(
 def _account_srdf(tree: Element, srdf: Path, allow_unused: Collection[str]) -> None:
     """Raise RecipeError for elements of an SRDF that are not honoured or unknown, and list those that are not used."""
     check_elements(tree, srdf, SRDF_NAMES, allow_unused=allow_unused)
-    if tree.find(_NO_DEFAULT) is not None:
-        text = f"its link would collide with no obstacle: give pairs by <{_TAG}>"
-        raise RecipeError([f"{srdf}: <{_NO_DEFAULT}> is not supported: {text}"])
-    if unused := sorted({f"<{element.tag}>" for element in tree} - {f"<{_TAG}>"}):
+    if tree.find(NO_DEFAULT) is not None:
+        text = f"its link would collide with no obstacle: give pairs by <{DISABLED}>"
+        raise RecipeError([f"{srdf}: <{NO_DEFAULT}> is not supported: {text}"])
+    if unused := sorted({f"<{element.tag}>" for element in tree} - {f"<{DISABLED}>"}):
         _LOG.info("%s: not used: %s", srdf, listed(unused))
 
 
@@ -279,26 +287,26 @@ def _with_entries(urdf: str, entries: list[dict[str, str]], source: str) -> str:
     robot = urdf_tree(urdf)
     links = {link.get("name", "") for link in robot.iter("link")}
     for entry in entries:
-        if missing := [key for key in _PAIR if key not in entry]:
+        if missing := [key for key in PAIR if key not in entry]:
             raise RecipeError([f"{source}: {entry} lacks {', '.join(missing)}"])
         if entry["link1"] == entry["link2"]:
             text = f"a pair names the link {entry['link1']!r} twice"
             raise RecipeError([f"{source}: {text}"])
-    named = {entry[key] for entry in entries for key in _PAIR}
+    named = {entry[key] for entry in entries for key in PAIR}
     if unknown := sorted(named - links):
         raise RecipeError([f"{source}: the URDF has no link {', '.join(unknown)}"])
     known = [
-        frozenset((one.get("link1"), one.get("link2"))) for one in robot.iter(_TAG)
+        frozenset((one.get("link1"), one.get("link2"))) for one in robot.iter(DISABLED)
     ]
     for entry in entries:
         if frozenset((entry["link1"], entry["link2"])) not in known:
-            robot.append(ElementTree.Element(_TAG, entry))
+            robot.append(ElementTree.Element(DISABLED, entry))
     return ElementTree.tostring(robot, encoding="unicode")
 
 
 def disabled_pairs(urdf: str) -> frozenset[frozenset[str]] | None:
     """Return the disabled link pairs; None without any."""
-    entries = list(urdf_tree(urdf).iter(_TAG))
+    entries = list(urdf_tree(urdf).iter(DISABLED))
     pairs = frozenset(
         frozenset((entry.get("link1", ""), entry.get("link2", ""))) for entry in entries
     )

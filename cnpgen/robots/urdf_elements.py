@@ -13,18 +13,18 @@ from cnpgen.store.files.accounted import MISSPELT
 _TOP = ("link", "joint")
 # Of which an element has several.
 _REPEATED = {*_TOP, "collision", "visual", "disable_collisions"}
-# tag -> its attributes and children that are read or change nothing (name, color)
+# tag -> its attributes, and its children in <>, that are read or change nothing (name)
 _KNOWN: dict[str, tuple[str, ...]] = {
-    "robot": ("name", "version", *_TOP),
-    "link": ("name", "inertial", "collision", "visual"),
+    "robot": ("name", "version", "<link>", "<joint>"),
+    "link": ("name", "<inertial>", "<collision>", "<visual>"),
     "joint": (
-        *("name", "type", "parent", "child", "origin", "axis", "limit", "dynamics"),
-        *("mimic", "safety_controller", "calibration"),
+        *("name", "type", "<parent>", "<child>", "<origin>", "<axis>", "<limit>"),
+        *("<dynamics>", "<mimic>", "<safety_controller>", "<calibration>"),
     ),
-    "inertial": ("origin", "mass", "inertia"),
-    "collision": ("name", "group", "origin", "geometry"),
-    "visual": ("name", "group", "origin", "geometry", "material"),
-    "geometry": ("box", "cylinder", "sphere", "capsule", "mesh"),
+    "inertial": ("<origin>", "<mass>", "<inertia>"),
+    "collision": ("name", "<origin>", "<geometry>"),
+    "visual": ("name", "<origin>", "<geometry>", "<material>"),
+    "geometry": ("<box>", "<cylinder>", "<sphere>", "<capsule>", "<mesh>"),
     "origin": ("xyz", "rpy"),
     "axis": ("xyz",),
     "parent": ("link",),
@@ -38,6 +38,8 @@ _KNOWN: dict[str, tuple[str, ...]] = {
     "safety_controller": (
         *("soft_lower_limit", "soft_upper_limit", "k_position", "k_velocity"),
     ),
+    # The zero of a sensor.
+    "calibration": ("reference_position", "rising", "falling"),
     "mass": ("value",),
     "inertia": ("ixx", "ixy", "ixz", "iyy", "iyz", "izz"),
     "box": ("size",),
@@ -46,8 +48,22 @@ _KNOWN: dict[str, tuple[str, ...]] = {
     "capsule": ("radius", "length"),
     "mesh": ("filename", "scale"),
 }
+DISABLED = "disable_collisions"
+NO_DEFAULT = "disable_default_collisions"
+PAIR = ("link1", "link2")
+# The problem names the planned joints, the tip and the placement of the base; pairs are
+# checked unless they are disabled, which takes precedence over <enable_collisions>.
+SRDF_NAMES: dict[str, tuple[str, ...]] = {
+    "robot": (
+        *("name", "version", f"<{DISABLED}>", f"<{NO_DEFAULT}>", "<group>"),
+        *("<group_state>", "<end_effector>", "<virtual_joint>", "<passive_joint>"),
+        *("<joint_property>", "<link_sphere_approximation>", "<enable_collisions>"),
+    ),
+    DISABLED: (*PAIR, "reason"),
+}
 _ANYWHERE = {"name", "type", "version", "group"}  # change nothing elsewhere
-_OPAQUE = {"material", "calibration"}  # colors, and the zero of a sensor
+_OPAQUE = {"material"}  # colors
+_TEXT = "the text"
 MAX_LISTED_TAGS = 10
 
 
@@ -77,7 +93,8 @@ def check_elements(
     if tree.tag != "robot":
         raise RecipeError([f"{path}: its root is <{tree.tag}>, expected <robot>"])
     hints = {
-        text: nearest(name, names, similarity=MISSPELT) or _other_place(name, known)
+        text: nearest(name, names, similarity=MISSPELT)
+        or _other_place(text, name, known)
         for text, name, names in _unknown(tree, known)
         if name not in allow_unused
     }
@@ -114,23 +131,41 @@ def _unknown(
     known = table.get(element.tag)
     if known is None:
         return
-    present = {*element.attrib, *(child.tag for child in element)} - _REPEATED
-    missing = tuple(name for name in known if name not in present)
+    present = {*element.attrib, *(f"<{child.tag}>" for child in element)}
+    present -= {f"<{tag}>" for tag in _REPEATED}
+    missing = tuple(name.strip("<>") for name in known if name not in present)
     for key in element.attrib:
         # attributes with a name space are those of other software
         if key not in known and not key.startswith("{"):
-            yield f"the attribute {key!r} of <{element.tag}>", key, missing
+            names = () if f"<{key}>" in known else missing
+            yield f"the attribute {key!r} of <{element.tag}>", key, names
+    if words := " ".join(
+        [element.text or "", *(each.tail or "" for each in element)]
+    ).split():
+        yield f"{_TEXT} {' '.join(words)!r:.40} in <{element.tag}>", element.tag, ()
     for child in element:
-        if child.tag not in known and child.tag not in _OPAQUE:
-            yield f"<{child.tag}> in <{element.tag}>", child.tag, missing
+        if f"<{child.tag}>" not in known and child.tag not in _OPAQUE:
+            names = () if child.tag in known else missing
+            yield f"<{child.tag}> in <{element.tag}>", child.tag, names
         else:
             yield from _unknown(child, table)
 
 
-def _other_place(name: str, table: Mapping[str, tuple[str, ...]]) -> str:
-    """Return the element in which a part is read, for messages, or an empty text."""
-    places = [tag for tag, names in table.items() if name in names]
-    return f" (it belongs in <{places[0]}>)" if places and name not in _ANYWHERE else ""
+def _other_place(text: str, name: str, table: Mapping[str, tuple[str, ...]]) -> str:
+    """Return where an unknown part is read, for messages, or an empty text."""
+    if text.startswith(_TEXT):
+        # Of elements with attributes alone, such as <axis>0 0 1</axis> of SDF.
+        has_children = any(each.startswith("<") for each in table[name])
+        return "" if has_children else f" (expected {listed(table[name])})"
+    tag = f"<{name}>"
+    own, other = (tag, name) if text.startswith("<") else (name, tag)
+    for kind, where in ((own, "it belongs in"), (other, f"{other} is read in")):
+        places = [parent for parent, names in table.items() if kind in names]
+        if places and (name not in _ANYWHERE or text.endswith(f" <{places[0]}>")):
+            return f" ({where} <{places[0]}>)"
+    # MoveIt reads these from an SRDF alone.
+    is_foreign = table is _KNOWN and text == f"{tag} in <robot>"
+    return " (it belongs in an SRDF)" * (is_foreign and tag in SRDF_NAMES["robot"])
 
 
 def _unknown_leaders(tree: Element) -> Iterator[str]:
@@ -149,12 +184,12 @@ def _repeated(element: Element, table: Mapping[str, tuple[str, ...]]) -> Iterato
     counts = Counter(
         "shape" if element.tag == "geometry" else f"<{child.tag}>"
         for child in element
-        if child.tag in known and child.tag not in {*_REPEATED, *_OPAQUE}
+        if f"<{child.tag}>" in known and child.tag not in {*_REPEATED, *_OPAQUE}
     )
     for what, count in counts.items():
         # A robot has several links, groups and states.
         if count > 1 and element.tag != "robot":
             yield f"a second {what} in <{element.tag}>"
     for child in element:
-        if child.tag in known:
+        if f"<{child.tag}>" in known:
             yield from _repeated(child, table)

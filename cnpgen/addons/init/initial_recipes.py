@@ -43,8 +43,7 @@ from cnpgen.robots.drive import NO_DRIVE, DriveSpec
 from cnpgen.robots.robot import Robot
 from cnpgen.robots.robot_spec import LimitSpec, RobotSpec
 from cnpgen.robots.urdf import read_urdf, urdf_tree
-from cnpgen.robots.urdf_changes import SRDF_NAMES
-from cnpgen.robots.urdf_elements import unknown_names
+from cnpgen.robots.urdf_elements import SRDF_NAMES, unknown_names
 from cnpgen.schema.keys import PerJoint, Range
 from cnpgen.store.files.accounted import check_allowed
 

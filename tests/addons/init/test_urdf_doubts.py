@@ -18,8 +18,13 @@ from cnpgen.problems.problem_file import load_problem
 from cnpgen.robots.robot import Robot
 from cnpgen.robots.robot_spec import LimitSources
 from cnpgen.robots.urdf import urdf_tree
-from cnpgen.robots.urdf_changes import SRDF_NAMES, with_disabled_pairs
-from cnpgen.robots.urdf_elements import _KNOWN, check_elements, unread_elements
+from cnpgen.robots.urdf_changes import with_disabled_pairs
+from cnpgen.robots.urdf_elements import (
+    _KNOWN,
+    SRDF_NAMES,
+    check_elements,
+    unread_elements,
+)
 from tests.refusals import is_refused
 
 BOX = '<geometry><box size="0.4 0.08 0.08"/></geometry>'
@@ -520,7 +525,7 @@ def chain_to(tag: str) -> list[str]:
     parents: dict[str, str] = {}
     for parent, names in _KNOWN.items():
         for name in names:
-            parents.setdefault(name, parent)
+            parents.setdefault(name.strip("<>"), parent)
     tags = [tag]
     while tags[0] != "robot":
         tags.insert(0, parents[tags[0]])
@@ -531,7 +536,7 @@ def chain_to(tag: str) -> list[str]:
 def test_every_misspelt_name_of_a_urdf_is_refused(tag: str) -> None:
     opening = "".join(f"<{each}>" for each in chain_to(tag))
     closing = "".join(f"</{each}>" for each in chain_to(tag)[::-1])
-    for name in _KNOWN[tag]:
+    for name in (each.strip("<>") for each in _KNOWN[tag]):
         for wrong in (f"{name}q", name.capitalize()[:-1] + name[-1:] * 2):
             for part in (f"<{wrong}/>", opening.removesuffix(">")):
                 text = f"{opening}{part}{closing}"
@@ -540,3 +545,105 @@ def test_every_misspelt_name_of_a_urdf_is_refused(tag: str) -> None:
                 with pytest.raises(RecipeError, match=f"{wrong}.*did you mean"):
                     check_elements(urdf_tree(text), Path("arm.urdf"))
         check_elements(urdf_tree(f"{opening}{closing}"), Path("arm.urdf"))
+
+
+@pytest.mark.parametrize("tag", _KNOWN)
+def test_children_given_as_attributes_and_the_reverse_are_refused(tag: str) -> None:
+    opening = "".join(f"<{each}>" for each in chain_to(tag))
+    closing = "".join(f"</{each}>" for each in chain_to(tag)[::-1])
+    for name in {*_KNOWN[tag]} - {"version", "name"}:
+        other = name.strip("<>") if name.startswith("<") else f"<{name}>"
+        start, part = opening, f"<{other.strip('<>')}/>"
+        if name.startswith("<"):
+            start, part = opening.removesuffix(">"), f" {other}='1'>"
+        with pytest.raises(RecipeError, match=f"{other}.* (is read|belongs) in <"):
+            check_elements(urdf_tree(f"{start}{part}{closing}"), Path("arm.urdf"))
+
+
+def test_a_mass_is_no_attribute_of_an_inertial(tmp_path: Path) -> None:
+    upper = UPPER.replace("<inertial>", "<inertial mass='7'>") + SHAPE
+    path = write(tmp_path / "a.urdf", upper=upper)
+    text = "the attribute 'mass' of <inertial> (<mass> is read in <inertial>)"
+    with pytest.raises(RecipeError, match=re.escape(text)):
+        initial(path)
+
+
+def test_texts_in_elements_are_refused_or_listed(tmp_path: Path) -> None:
+    """An axis as SDF states it would be that of x."""
+    tree = urdf_tree("<robot><joint><axis>0 0 1</axis></joint></robot>")
+    text = "the text '0 0 1' in <axis> (expected xyz) would not be read"
+    with pytest.raises(RecipeError, match=re.escape(text)):
+        check_elements(tree, Path("arm.urdf"))
+    check_elements(tree, Path("arm.urdf"), allow_unused=["axis"])
+    path = write(tmp_path / "a.urdf", upper=UPPER + "four" + SHAPE + "kg")
+    assert "the text 'four kg' in <link> is not read, 1 time" in notes(path)
+
+
+def test_unknown_parts_of_a_calibration_and_groups_are_listed(tmp_path: Path) -> None:
+    limit = LIMIT + "<calibration rising='0.1' offset='0.2'><zero/></calibration>"
+    shape = SHAPE.replace("<collision>", "<collision group='a'>")
+    found = notes(write(tmp_path / "a.urdf", upper=UPPER + shape, limit=limit))
+    for part in ("the attribute 'offset' of <calibration>", "<zero> in <calibration>"):
+        assert f"{part} is not read, 1 time" in found
+    assert "the attribute 'group' of <collision> is not read, 1 time" in found
+
+
+@pytest.mark.parametrize("name", SRDF_NAMES["robot"][2:])
+def test_elements_of_an_srdf_in_a_urdf_are_refused(tmp_path: Path, name: str) -> None:
+    part = name.replace(">", " link1='base' link2='wrist'/>")
+    path = write(tmp_path / "a.urdf", more=part)
+    text = f"{name} in <robot> (it belongs in an SRDF)"
+    with pytest.raises(RecipeError, match=re.escape(text)):
+        initial(path)
+
+
+def test_link_pairs_that_a_urdf_disables_are_left_unused(tmp_path: Path) -> None:
+    pair = "<disable_collisions link1='base' link2='wrist'/>"
+    path = write(tmp_path / "a.urdf", more=pair)
+    found = initial(path, allow_unused=("disable_collisions",)).problem
+    plain = initial(write(tmp_path / "b.urdf")).problem
+    assert links(load_robot(found)) == {"base", "upper", "wrist"}
+    shapes = load_robot(found).shape, load_robot(plain).shape
+    assert repr(shapes[0].pairs) == repr(shapes[1].pairs)
+    # Elements of other parts are not read by MoveIt either.
+    nested = write(tmp_path / "c.urdf", upper=UPPER + SHAPE + pair)
+    assert repr(load_robot(initial(nested).problem).shape.pairs) == repr(
+        shapes[1].pairs
+    )
+
+
+def test_an_srdf_of_another_robot_is_a_warning(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    urdf = write(tmp_path / "a.urdf").read_text()
+    srdf = tmp_path / "a.srdf"
+    for name in ("arm", "crane"):
+        srdf.write_text(f"<robot name='{name}'/>")
+        with_disabled_pairs(urdf, srdf)
+        warned = f"a.srdf is of the robot {name!r}, the URDF of 'arm'" in caplog.text
+        assert warned == (name != "arm")
+
+
+@pytest.mark.parametrize(
+    ("content", "text"),
+    [
+        (
+            "<actuator><mechanicalReduction>9</mechanicalReduction></actuator>",
+            "<mechanicalReduction>",
+        ),
+        ("<actuator><motorInertia>1</motorInertia></actuator>", "<motorInertia>"),
+        (
+            "<mechanicalReduction>9</mechanicalReduction><motorInertia>1</motorInertia>",
+            "<mechanicalReduction> and <motorInertia>",
+        ),
+    ],
+)
+def test_the_parts_of_a_transmission_are_listed(
+    tmp_path: Path, content: str, text: str
+) -> None:
+    more = f"<transmission><joint name='j1'/>{content}</transmission>"
+    found = read_arm(write(tmp_path / "a.urdf", more=more), "wrist").joint_notes
+    assert found == (
+        f"not used of the <transmission> of j1: {text};"
+        " gear_ratio and rotor_inertia of [drive] state both",
+    )
