@@ -75,19 +75,29 @@ def read_allowed_collisions(
         # Two links are a matter of the robot, and two objects of the world never move.
         if not pair.isdisjoint((*world, *attached)) and not pair.issubset(world):
             touching.setdefault(body, []).extend(others)
-    if matrix:
-        scene.account.unused.append(ACM)
-    # A name that is no object may be a link, or a misspelt object.
-    known = {*world, *attached}
-    for name in sorted(names - known):
-        if hint := nearest(name, sorted(known - names), similarity=MISSPELT):
-            scene.account.unused.append(f"{ACM}.{name}{hint}")
+    mentioned = names.union(always, never)
+    scene.account.unused += _unused_parts(mentioned, world, attached)
     if refused:
         text = "expected pairs, or names without a default of false that all may touch"
         scene.account.refuse(ACM, refused[0], text)
     ignored = frozenset(world) & frozenset(always)
     found = {body: tuple(links) for body, links in touching.items()}
     return AllowedCollisions(found, ignored)
+
+
+def _unused_parts(
+    names: Collection[str], world: Collection[str], attached: Collection[str]
+) -> Iterator[str]:
+    """Yield the parts of a matrix without effect: pairs of two links or of two objects of the world, and misspelt names."""
+    known = {*world, *attached}
+    links = sorted({*names}.difference(known))
+    for what, part_of in (("links", links), ("objects", {*names}.intersection(world))):
+        if len(part_of) > 1:
+            yield f"{ACM}.pairs of {what}"
+    # A name that is no object may be a link, or a misspelt object.
+    for name in links:
+        if hint := nearest(name, sorted(known.difference(names)), similarity=MISSPELT):
+            yield f"{ACM}.{name}{hint}"
 
 
 def _defaults(matrix: Any, place: str) -> tuple[list[str], list[str]]:

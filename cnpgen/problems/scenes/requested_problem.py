@@ -10,6 +10,7 @@ from cnpgen.errors import RecipeError, listed
 from cnpgen.problems.constraints.clearance import RobotClearance
 from cnpgen.problems.constraints.joint import JointTorque
 from cnpgen.problems.constraints.link_clearance import SelfClearance
+from cnpgen.problems.limit_sources import NOT_STATED, WORDS, limit_sources
 from cnpgen.problems.load_robot import load_robot
 from cnpgen.problems.problem import Problem
 from cnpgen.problems.problem_record import ProblemRecord, as_problem, record_problem
@@ -22,6 +23,7 @@ from cnpgen.robots.attached_links import (
     with_padded_link,
 )
 from cnpgen.robots.robot import Robot
+from cnpgen.robots.robot_spec import LimitSources
 from cnpgen.robots.urdf import urdf_tree
 from cnpgen.robots.urdf_changes import with_ignored_pairs
 from cnpgen.schema.arguments import check_range, number
@@ -142,10 +144,21 @@ def _without_changes(scene: SceneProblem) -> SceneProblem:
 def _with_scales(problem: Problem, robot: Robot, scene: SceneProblem) -> Problem:
     """Return the problem with scaled limits of velocities and accelerations; those of jerks and torques stay."""
     request = scene.request
+    if request.velocity_scale == request.acceleration_scale == 1.0:
+        return problem
     # Default limits of accelerations and jerks follow from those of velocities: stated
-    # as numbers, they do not scale with these.
+    # as numbers, they do not scale with these. Their sources stay.
+    sources = limit_sources(problem, robot)
+    texts = {
+        name: f"{each.basis}: {each.source or WORDS[each.basis]}"
+        for name in ("acceleration", "jerk")
+        if (each := sources[name]).basis != NOT_STATED
+    }
+    if "acceleration" in texts and request.acceleration_scale != 1.0:
+        texts["acceleration"] += f", times {request.acceleration_scale:g}"
     limits = replace(
         problem.limits,
+        sources=replace(problem.limits.sources or LimitSources(), **texts),
         velocity_scale=problem.limits.velocity_scale * request.velocity_scale,
         acceleration=PerJoint(
             tuple((request.acceleration_scale * robot.acceleration_limit).tolist())

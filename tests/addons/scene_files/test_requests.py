@@ -14,6 +14,7 @@ import cnpgen
 from cnpgen.cli.main import main
 from cnpgen.errors import UsageError
 from cnpgen.plans.scene_plans import goal_states, scene_plans, start_state
+from cnpgen.problems.limit_sources import limit_sources
 from cnpgen.problems.load_robot import load_robot
 from cnpgen.problems.problem_record import open_problem, record_problem
 from cnpgen.problems.scenes.placement import placed_scene
@@ -775,6 +776,42 @@ def test_a_misspelt_object_in_a_matrix_is_listed(
         load_scenes(tmp_path / "scene.yaml")
         text = "allowed_collision_matrix.shef (did you mean 'shelf'?)"
         assert (text in caplog.text) == listed
+
+
+@pytest.mark.parametrize(
+    ("names", "unused"),
+    [
+        (("panda_link5", "post"), ""),
+        (("panda_link5", "panda_hand"), "pairs of links"),
+        (("post", "shelf"), "pairs of objects"),
+    ],
+)
+def test_pairs_of_a_matrix_that_are_applied_are_not_listed(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture, names: Any, unused: str
+) -> None:
+    caplog.set_level("INFO", "cnpgen")
+    shelf = box("shelf", [0.1, 0.1, 0.1], [0.8, 0, 0.2], "panda_link0")
+    world = {"collision_objects": [*request()["world"]["collision_objects"], shelf]}
+    rows = [{"enabled": [False, True]}, {"enabled": [True, False]}]
+    entries = {"entry_names": [*names], "entry_values": rows}
+    scene_of(tmp_path, request(world=world, allowed_collision_matrix=entries))
+    text = f"not used: allowed_collision_matrix.{unused} ("
+    assert (text in caplog.text) if unused else ("not used" not in caplog.text)
+
+
+def test_demands_of_a_request_keep_the_sources_of_limits(tmp_path, robot):
+    """Accelerations that a rule guesses stay guesses, scaled or not."""
+    problem = robot_problem()
+    before = limit_sources(problem, robot)
+    content = request(allowed_collision_matrix=matrix(("post", "panda_link5")))
+    for scale, suffix in ((1, ""), (0.5, ", times 0.5")):
+        scaled = content | {"max_acceleration_scaling_factor": scale}
+        scene = placed(scene_of(tmp_path, scaled), robot)
+        changed_problem, other, _ = requested_problem(problem, robot, [scene])
+        after = limit_sources(changed_problem, other)
+        assert after["jerk"] == before["jerk"]
+        assert after["acceleration"].basis == before["acceleration"].basis
+        assert after["acceleration"].source == before["acceleration"].source + suffix
 
 
 def test_a_matrix_that_allows_and_forbids_a_pair_is_refused(tmp_path: Path) -> None:
