@@ -18,6 +18,7 @@ from cnpgen.robots.plausible_values import UnitError
 from cnpgen.store.scene_table import OBSTACLE_POSES
 from cnpgen.trajectory.boundary import Boundary
 from tests.conftest import columns_of, some
+from tests.examples.example_robots import needs_robots
 from tests.examples.models import boundary_of_columns, untrained_model
 from tests.refusals import is_refused
 
@@ -314,6 +315,7 @@ def test_no_tasks_give_no_plans(planner, rows):
     assert len(planner.plan_batch(rows[:0])) == 0
 
 
+@needs_robots
 def test_no_tasks_of_a_model_with_corrected_lines_give_no_plans() -> None:
     none = draw_boundary_problems("panda-scenes", 1)[:0]
     poses = {OBSTACLE_POSES: none.columns[OBSTACLE_POSES]}
