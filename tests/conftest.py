@@ -315,6 +315,9 @@ def fresh_compiler() -> Iterator[None]:
 
 
 @pytest.fixture(autouse=True)
-def _wording(snapshot: SnapshotAssertion) -> None:
+def _wording(
+    snapshot: SnapshotAssertion, tmp_path_factory: pytest.TempPathFactory
+) -> None:
     """Give ``is_refused`` the snapshots of the running test."""
     refusals.RunningTest.texts = snapshot.use_extension(refusals.Wording)
+    refusals.RunningTest.base = tmp_path_factory.getbasetemp()

@@ -5,8 +5,6 @@ again (syrupy); the reviewer reads their difference.
 """
 
 import re
-import sys
-import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
 from math import isclose
@@ -18,9 +16,8 @@ from syrupy.assertion import SnapshotAssertion
 from syrupy.extensions.amber import AmberSnapshotExtension
 
 ROOT = str(Path(__file__).parents[1])
-HOME = str(Path.home())
-# Folder of a test: the base that pytest or a worker of it chose, and its own name.
-FOLDER = r"/pytest-of-[^/\s]+/pytest-\d+(/popen-gw\d+)?/[^/\s'\",:)]+"
+# Of files and data that tests compute, whole or shortened.
+DIGEST = re.compile(r"\b[0-9a-f]{12}(?:[0-9a-f]{52}\b|(?=\.\.\.))")
 # Fractions, whose last digits depend on the processor.
 FRACTION = re.compile(r"(?<![\w.])-?\d+\.\d+(?:e[+-]?\d+)?(?![\w.])")
 RELATIVE_ERROR = 1e-2  # texts show three or four digits
@@ -30,10 +27,12 @@ class RunningTest:
     """The running test.
 
     Attributes:
-        texts: Its stored texts, set by tests/conftest.py.
+        texts: Its stored texts, set by tests/conftest.py, as the next one.
+        base: Folder for the folders of tests, which pytest or a worker of it chose.
     """
 
     texts: SnapshotAssertion
+    base: Path
 
 
 class Wording(AmberSnapshotExtension):
@@ -49,10 +48,9 @@ class Wording(AmberSnapshotExtension):
 
 
 def portable(text: str) -> str:
-    """Replace the folders of a machine in a text."""
-    text = re.sub(re.escape(tempfile.gettempdir()) + FOLDER, "TEST", text)
-    text = text.replace(sys.prefix, "PYTHON")
-    return text.replace(ROOT, "ROOT").replace(HOME, "HOME")
+    """Replace the folders of a machine, and digests, in a text."""
+    text = re.sub(rf"{re.escape(str(RunningTest.base))}/[^/\s'\",:)]+", "TEST", text)
+    return DIGEST.sub("DIGEST", text.replace(ROOT, "ROOT"))
 
 
 @contextmanager

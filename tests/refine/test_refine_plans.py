@@ -229,7 +229,7 @@ def test_an_interrupted_run_resumes(
         )
     with monkeypatch.context() as patch:
         patch.setattr("cnpgen.refine.refine_plans.__version__", "99.0")
-        with is_refused(UsageError, argument="discard"):
+        with pytest.raises(UsageError, match=r"differs in version .*, now '99.0'"):
             refine_plans(problems, workers=1, journal=journal)
 
 

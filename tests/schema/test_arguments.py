@@ -27,13 +27,18 @@ def test_integers_of_numpy_are_integers(value: Any) -> None:
     assert (found, type(found)) == (3, int)
 
 
-@pytest.mark.parametrize(
-    "value", [2, 8, 3.0, "3", None, True, np.bool_(True), np.float64(3), [3]]
-)
+@pytest.mark.parametrize("value", [2, 8, 3.0, "3", None, True, [3]])
 def test_values_that_are_no_integers_or_outside_their_bounds_are_refused(
     value: object,
 ) -> None:
     with is_refused(UsageError, argument="n"):
+        integer("n", value, least=3, most=7)
+
+
+@pytest.mark.parametrize("value", [np.bool_(True), np.float64(3)])
+def test_other_numbers_of_numpy_are_no_integers(value: object) -> None:
+    # Their representation depends on the version of NumPy.
+    with pytest.raises(UsageError, match=r"^n must be an integer from 3 to 7, got "):
         integer("n", value, least=3, most=7)
 
 
@@ -45,7 +50,7 @@ def test_numbers_of_numpy_are_numbers(value: Any) -> None:
 
 @pytest.mark.parametrize(
     "value",
-    ["0.5", None, True, np.nan, np.inf, 1j, np.complex128(1), [0.5], np.array([0.5])],
+    ["0.5", None, True, np.nan, np.inf, 1j, [0.5], np.array([0.5])],
 )
 def test_what_is_no_finite_number_is_refused(value: object) -> None:
     with is_refused(UsageError, argument="x"):

@@ -122,7 +122,7 @@ def test_kernels_are_compiled_in_a_temporary_folder_after_one_warning(
 def test_a_temporary_folder_is_removed_only_by_the_process_that_created_it(unwritable):
     command = [sys.executable, "-c", FALLBACK, str(unwritable)]
     done = subprocess.run(command, capture_output=True, text=True, check=True)
-    folder, was_there = done.stdout.split()
+    folder, was_there = done.stdout.rsplit(maxsplit=1)
     assert was_there == "True"
     assert not Path(folder).exists()
 

@@ -194,7 +194,8 @@ def test_the_size_limit_applies_to_all_datasets_together(tmp_path: Path) -> None
     assert MAX_EXPANSION * path.stat().st_size < MIN_EXPANSION_LIMIT_BYTES
     with open_hdf5(path) as file:
         assert len({name: file[name] for name in ("note0", "note1", "note2")}) == 3
-        with is_refused(DatasetError):
+        # The size of the file depends on the HDF5 library.
+        with pytest.raises(DatasetError, match="note3 declares the shape"):
             file["note3"]
 
 

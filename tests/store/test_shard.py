@@ -181,7 +181,10 @@ def test_damaged_shards_are_refused_by_name(
     path = tmp_path / "shard-00000.h5"
     write(path)
     path.write_bytes(action(path.read_bytes()))
-    with is_refused(DatasetError):
+    # The HDF5 library words what follows.
+    with pytest.raises(
+        DatasetError, match=r"shard-00000.h5 is (damaged or cut|not an)"
+    ):
         read(path)
 
 

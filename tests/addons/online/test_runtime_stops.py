@@ -172,9 +172,11 @@ def test_a_stopped_runtime_resumes_at_rest_and_only_after_the_stop(planner, exec
     with is_refused(UsageError, argument="at"):
         executing.resume(measured)
     executing.set_point(np.arange(0.15, stop.end_time + 0.5, 0.01))
-    for wrong in (measured[:3], np.full(6, np.nan), "here"):
+    for wrong in (measured[:3], np.full(6, np.nan)):
         with is_refused(UsageError, argument="measured_q"):
             executing.resume(wrong)
+    with pytest.raises(UsageError, match="measured_q must be an array of numbers"):
+        executing.resume("here")
     assert executing.stopped
     executing.resume(measured)
     assert not executing.stopped

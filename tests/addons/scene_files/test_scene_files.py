@@ -430,7 +430,10 @@ def test_invalid_hdf5_scenes_are_refused(
 def test_documents_of_a_million_brackets_are_refused(tmp_path: Path) -> None:
     for text in ("[" * 1_000_000, "- " * 100_000, "{a: " * 100_000):
         (tmp_path / "deep.yaml").write_text(text)
-        with is_refused(SceneError):
+        # LibYAML, where it is installed, words it in its own way.
+        with pytest.raises(
+            SceneError, match=r"deep.yaml is (not YAML|nested too deeply)"
+        ):
             load_scenes(tmp_path / "deep.yaml")
 
 

@@ -306,5 +306,5 @@ def test_tables_of_parquet_and_hdf5_are_read(tmp_path: Path) -> None:
     assert trajectory.dq is not None
     assert np.array_equal(trajectory.dq, 2 * q)
     (tmp_path / "c.parquet").write_bytes(b"PAR1 nothing")
-    with is_refused(UsageError, argument="path"):
+    with pytest.raises(UsageError, match=r"c.parquet is not a Parquet file, or is dam"):
         load_trajectories(tmp_path / "c.parquet", AIRHOCKEY)

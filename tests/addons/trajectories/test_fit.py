@@ -301,7 +301,7 @@ def test_a_boundary_of_a_wrong_shape_raises_an_error() -> None:
         fit_motion(t, q, spec=SPEC, boundary=at_rest(np.zeros((2, 2))))
     with is_refused(UsageError, argument="boundary"):
         fit_motion(t, q, spec=SPEC, boundary=at_rest(np.full((2, 3), np.nan)))
-    with is_refused(UsageError, argument="boundary"):
+    with pytest.raises(UsageError, match="boundary must be an array of numbers"):
         fit_motion(
             t,
             q,
