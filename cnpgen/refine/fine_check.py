@@ -75,6 +75,7 @@ class FineCheck:
         self.projects = bool(self.equalities) or any(
             condition.projected for condition in conditions
         )
+        self.projection_accuracy = self._bounds.projection_accuracy
         limits = np.repeat(
             [condition.tolerance_kind == "limit" for condition in conditions],
             [len(condition.g) for condition in conditions],

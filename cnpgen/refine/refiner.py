@@ -500,7 +500,8 @@ class Refiner:
         """Return the equalities that trees keep, or None if there are none."""
         if not self.check.projects or not self.equalities.tape.outputs[0]:
             return None
-        return EqualityKernel(self.equalities, self.kernel_poses(task))
+        accuracy = self.check.projection_accuracy
+        return EqualityKernel(self.equalities, self.kernel_poses(task), accuracy)
 
     @cached_property
     def equalities(self) -> Kernel:

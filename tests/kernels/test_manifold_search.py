@@ -35,9 +35,9 @@ tolerance = 1e-3
 class Setting:
     """The crane beside a wall, whose tip stays at a height."""
 
-    def __init__(self, folder, obstacles):
+    def __init__(self, folder, obstacles, more=LEVEL):
         self.problem = load_problem(
-            write_problem(folder, obstacles=obstacles, more=LEVEL)
+            write_problem(folder, obstacles=obstacles, more=more)
         )
         self.robot = load_robot(self.problem)
         self.tool, self.poses = (
@@ -109,6 +109,12 @@ def test_paths_keep_the_height_and_are_clear_by_coal(setting, margin):
         .clear_states(line.T.copy(), setting.poses)
         .all()
     )
+
+
+def test_small_tolerances_are_met(tmp_path):
+    tight = Setting(tmp_path, WALL, LEVEL.replace("1e-3", "1e-6"))
+    path = tight.search()
+    assert max(abs(tight.height(q) - HEIGHT_M) for q in path) < 1.5e-7
 
 
 def test_paths_are_reproducible_and_shortened(setting):

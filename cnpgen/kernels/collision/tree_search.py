@@ -82,10 +82,13 @@ class EqualityKernel:
         residuals: Compiled kernel ``(q, scene) -> (r, dr/dq)``, the Jacobian column by
             column.
         scene: Values of the scene that it takes, shape (width,).
+        accuracy: Largest residual of a state on the manifold, if it is less than
+            ``MAX_PROJECTION_ERROR``.
     """
 
     residuals: Kernel
     scene: Array
+    accuracy: float
 
 
 @dataclass(frozen=True)
@@ -189,7 +192,7 @@ def _search(
         search.errcheck = require_memory
         residuals = manifold.residuals.address
         rows = manifold.residuals.tape.outputs[0]
-        errors = rows, MAX_PROJECTION_ERROR
+        errors = rows, min(manifold.accuracy, MAX_PROJECTION_ERROR)
         count = search(
             ctypes.addressof(native),
             residuals,

@@ -39,6 +39,7 @@ PHASE_FACTOR = 1.03
 PRECISE_FRACTION = 0.1
 # Of the distance from a path, on the grid: motions overshoot between its points.
 NEAR_FRACTION = 0.97
+PROJECTED_FRACTION = 0.1  # of the smallest tolerance: the error of projected states
 # Of the tolerance between grid points: the interpolation has an error.
 INTERVAL_FRACTION = 0.9
 
@@ -228,6 +229,7 @@ class BoundsTemplate:
                 for scale, width in zip(scales, widths, strict=True)
             ]
         )
+        self.projection_accuracy = _projection_accuracy(pairs)
         self.equal = np.repeat(
             [condition.is_equality for condition in self.conditions], widths
         )
@@ -353,6 +355,16 @@ def _tolerances(constraint: Constraint, condition: Condition) -> Array:
     if condition.sufficient:
         return np.full(len(condition.g), UNKNOWN_TOLERANCE)
     return constraint.allowed(condition) / _scale(constraint, condition)
+
+
+def _projection_accuracy(pairs: list[tuple[Constraint, Condition]]) -> float:
+    """Return the largest error of projected states in equalities, in their units."""
+    allowed = [
+        constraint.allowed(condition).min(initial=np.inf)
+        for constraint, condition in pairs
+        if condition.is_equality
+    ]
+    return PROJECTED_FRACTION * float(min(allowed, default=np.inf))
 
 
 def _bounds(
