@@ -87,7 +87,12 @@ class RecordFormat:
 
     def require(self, path: Path, found: JsonObject, identity: JsonMapping) -> None:
         """Raise UsageError, which names the differences, if a head is not that of this run."""
-        changed = [str(each) for each in differences(found, self.head(identity))]
+        own = self.head(identity)
+        # Of a file of another version only the keys that it has say something.
+        if found.get("format_version") != self.version:
+            known = {*found, "format_version"}
+            own = {key: value for key, value in own.items() if key in known}
+        changed = [str(each) for each in differences(found, own)]
         if changed:
             shown = ", ".join(changed[:MAX_SHOWN_DIFFERENCES])
             raise UsageError(
