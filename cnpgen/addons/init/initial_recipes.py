@@ -27,7 +27,10 @@ from cnpgen.pipelines.stages.draw import DrawPositions
 from cnpgen.pipelines.stages.ik import GoalIK, StartIK
 from cnpgen.pipelines.stages.stage import Stage
 from cnpgen.pipelines.stages.torque import GravityTorque
-from cnpgen.problems.constraints.clearance import RobotClearance
+from cnpgen.problems.constraints.clearance import (
+    MAX_LINK_PENETRATION_M,
+    RobotClearance,
+)
 from cnpgen.problems.constraints.constraint import Constraint
 from cnpgen.problems.constraints.joint import (
     JointAcceleration,
@@ -206,8 +209,8 @@ def _constraints(arm: Arm) -> tuple[Constraint, ...]:
     if not arm.has_shape:
         return constraints
     clearances = (
-        RobotClearance(tolerance=1e-3, budget=1e-6),
-        SelfClearance(tolerance=1e-3, budget=1e-6),
+        RobotClearance(tolerance=MAX_LINK_PENETRATION_M, budget=1e-6),
+        SelfClearance(tolerance=MAX_LINK_PENETRATION_M, budget=1e-6),
     )
     return (*constraints, *clearances)  # obstacles may follow
 

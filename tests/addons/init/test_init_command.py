@@ -167,6 +167,13 @@ def test_what_was_found_out_is_said_at_the_top(crane):
     assert "of the draws" in (crane / "pipeline.toml").read_text(encoding="utf-8")
 
 
+def test_reading_the_recipes_again_says_nothing(
+    crane: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    load_problem(crane / "problem.toml")
+    assert not caplog.messages
+
+
 def test_the_base_configuration_is_ahead_and_links_do_not_touch_there(crane):
     robot = load_robot(load_problem(crane / "problem.toml"))
     world = World(robot)
