@@ -4,8 +4,6 @@ import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
-import numpy as np
-
 from cnpgen.arrays import Vector3
 from cnpgen.documents import NamedErrors
 from cnpgen.robots.obstacle_shapes.box_shape import UprightBox
@@ -16,7 +14,7 @@ from cnpgen.robots.obstacle_shapes.obstacle_shape import (
     shape_class,
 )
 from cnpgen.robots.parameter_ranges import optional_key
-from cnpgen.robots.shape.hull import CUBE, MAX_COORDINATE_M, check_solid
+from cnpgen.robots.shape.hull import MAX_COORDINATE_M, check_solid
 from cnpgen.robots.shape.inline import is_inline
 from cnpgen.schema import registry
 from cnpgen.schema.keys import Range, field, keys
@@ -209,11 +207,12 @@ class Obstacle:
             return
         try:
             corners, radius = body.polytope()
-            # A radius makes a body of points and segments, too.
-            ball = corners[:1] + radius * CUBE
-            check_solid(np.concatenate([corners, ball]) if radius else corners)
+            check_solid(corners)
         except ValueError as error:
             yield "mesh" if self.mesh else "shape", str(error)
+            return
+        if not 0 <= radius < MAX_COORDINATE_M:
+            yield "shape", f"its radius must not be negative or large, got {radius} m"
 
     def _given(self, keys: Iterable[str]) -> list[str]:
         """Return the given keys among some keys."""

@@ -29,6 +29,7 @@ from cnpgen.problems.problem_file import load_problem, restore_problem
 from cnpgen.problems.scenes.observe import observe
 from cnpgen.problems.scenes.scene_problem import SceneProblem, checked_scene
 from cnpgen.robots.observation.observations import DistanceGrid, SurfaceCloud
+from cnpgen.robots.shape.hull import CUBE
 from cnpgen.robots.solid import place_obstacles, solids_of
 from cnpgen.schema.entry_points import entry_points
 from cnpgen.world.collision_world import CollisionWorld
@@ -214,6 +215,29 @@ def test_dimensions_of_python_are_checked(
     shape = replace(obstacle.shape, **{name: value})
     with pytest.raises(UsageError, match=name):
         problem.with_obstacles([replace(obstacle, shape=shape)])
+
+
+@pytest.mark.parametrize(
+    ("corners", "radius", "text"),
+    [
+        (np.zeros((1, 3)), 0.1, "corners are not those of a body"),
+        (CUBE * [0.2, 0.2, 0], 0.1, "corners are not those of a body"),
+        (CUBE, -0.1, "radius must not be negative or large"),
+        (CUBE, np.nan, "radius must not be negative or large"),
+    ],
+)
+def test_polytopes_that_are_no_bodies_are_refused(
+    problem: Problem,
+    monkeypatch: pytest.MonkeyPatch,
+    corners: np.ndarray,
+    radius: float,
+    text: str,
+) -> None:
+    (obstacle,) = problem.obstacle
+    polytope = lambda _: (corners, radius)  # noqa: E731
+    monkeypatch.setattr(type(obstacle.shape), "polytope", polytope)
+    with pytest.raises(UsageError, match=text):
+        problem.with_obstacles([obstacle])
 
 
 def test_scenes_refuse_the_shape_of_a_package(problem: Problem) -> None:

@@ -42,7 +42,8 @@ class ObstacleShape(ABC):
     def polytope(self) -> tuple[Array, float]:
         """Return the corners of a convex hull in the frame of the shape [m], shape (V, 3), and a radius around it [m].
 
-        They contain the shape; the order of the corners must not change.
+        They contain the shape; the order of the corners must not change. The corners of
+        a package's shape are not coplanar.
         """
 
     @classmethod
