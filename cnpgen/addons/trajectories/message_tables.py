@@ -52,23 +52,20 @@ UNUSED_ELEMENTS = UnusedElements(
         "multi_dof_trajectory.joint_names": "it has no points",
         "header.seq": "number of the message",
         "header.frame_id": "positions of joints have no frame",
-        "effort": "torques follow from the motion",
         "error_code.message": "text",
         "error_code.source": "text",
         "group_name": "name",
-        "model_id": "name",
         "planner_id": "name",
         "pipeline_id": "name",
         "planning_time": "of the planner",
         "processing_time": "of the planner",
         "goal_id": "number of the goal",
         "status": "error_code is read",
-        "trajectory_start.joint_state": "the points have positions",
-        "start_state.joint_state": "the points have positions",
         "trajectory_start.is_diff": "of the state of the planner",
         "start_state.is_diff": "of the state of the planner",
     },
     {
+        "effort": "torques follow from the motion",
         "path_tolerance": "of a controller",
         "goal_tolerance": "of a controller",
         "component_path_tolerance": "of a controller",
@@ -120,7 +117,13 @@ def _tables(document: Any, place: str) -> Iterator[TrajectoryTable]:
         key := next((key for key in _NESTING if document.get(key)), None)
     ):
         _check_message(document, place)
-        yield from _tables(document[key], f"{place}: {key}")
+        start = _start_of(document, place)
+        model = str(document.get("model_id") or "")
+        for table in _tables(document[key], f"{place}: {key}"):
+            name = model or table.robot_name
+            yield replace(table, start=start or table.start, robot_name=name)
+            # The first of several begins at the start.
+            start = {}
     elif isinstance(document, dict) and any(
         isinstance(values, list) for values in document.values()
     ):
@@ -165,6 +168,25 @@ def _check_message(message: JsonMapping, place: str) -> None:
         raise UsageError(
             f"{place}: error_code is {value!r:.20}, expected {_SUCCESS}: the request failed"
         )
+
+
+def _start_of(message: JsonMapping, place: str) -> dict[str, tuple[float, float]]:
+    """Return the positions and velocities (nan if unknown) of the joints in the start state of a message."""
+    key = next((key for key in _STARTS if message.get(key)), "")
+    state = message.get(key)
+    joints = state.get("joint_state") if isinstance(state, dict) else None
+    if not isinstance(joints, dict) or not joints.get("name"):
+        return {}
+    where = f"{place}: {key}.joint_state"
+    names = _names(joints["name"], f"{where}.name")
+    columns: dict[str, list[Any]] = {}
+    _append(columns, joints, _STATE_FIELDS, range(len(names)), where)
+    unknown = [[math.nan] * len(names)]
+    q, dq = (
+        _array(columns.get(column, unknown), where)[0].tolist()
+        for column in _STATE_FIELDS.values()
+    )
+    return dict(zip(names, zip(q, dq, strict=True), strict=True))
 
 
 def is_joint_state(document: Any) -> bool:
@@ -224,6 +246,12 @@ def _append(
             )
         mark_read(values)
         columns.setdefault(name, []).append([values[row] for row in rows])
+    # Efforts are listed as unused, unless they are empty.
+    efforts = dict.get(dict(point), "effort") or point.get("effort") or []
+    if not isinstance(efforts, list) or len(efforts) not in {0, len(rows)}:
+        raise UsageError(
+            f"{where}.effort must have {len(rows)} values, one per joint, or none"
+        )
 
 
 def _table_of_points(
@@ -237,7 +265,8 @@ def _table_of_points(
                 f"{place}: {len(t) - len(rows)} of {len(t)} points have no {name}, and others do"
             )
     found = {name: _array(rows, f"{place}: {name}") for name, rows in columns.items()}
-    return TrajectoryTable(place, {MESSAGE_TIME: t, **found}, tuple(names))
+    found |= {MESSAGE_TIME: t}
+    return TrajectoryTable(place, found, tuple(names), has_units=True)
 
 
 def _from_rows(rows: Sequence[JsonMapping], place: str) -> dict[str, Values]:

@@ -34,11 +34,12 @@ from cnpgen.documents import NamedNumbers
 from cnpgen.errors import UsageError, listed, nearest
 from cnpgen.plans.format import PHASE_COLUMN
 from cnpgen.problems.problem_record import ProblemRecord
+from cnpgen.robots.urdf import urdf_tree
 from cnpgen.store.scene_table import OBSTACLE_POSES
 
-UNUSED_KINDS = ("jerk", "effort", "efforts")  # not reported as ignored
 MAX_EXACT_START_S = 1e6  # later times of the first sample lose digits in float64
 MAX_HELD_DIFFERENCE = 1e-9  # rad or m, of joints that are not planned
+MAX_START_DIFFERENCE = 1e-4  # rad or m, and 1/s, of a start from the first sample
 MAX_LISTED = 12  # columns in messages
 # Whether the first time is positive -> note.
 _FIRST_TIMES = {
@@ -54,7 +55,7 @@ class TableReader:
     The joints, and columns with their velocities, have one name in the file for each of the problem.
     ``used`` has the names of the columns that were read, ``notes`` sentences about how,
     ``other_joints`` the joints of arrays that the problem does not plan, ``lacks_unit`` whether a column of
-    revolute joints states no unit.
+    revolute joints states no unit, ``lacks_joint_unit`` whether one of any joint does.
     """
 
     table: TrajectoryTable
@@ -68,6 +69,7 @@ class TableReader:
     notes: list[str] = field(default_factory=list)
     other_joints: list[str] = field(default_factory=list)
     lacks_unit: bool = False
+    lacks_joint_unit: bool = False
 
     def trajectory(self) -> Trajectory:
         """Return the trajectory; its parameters are None if some are missing."""
@@ -99,7 +101,37 @@ class TableReader:
                 f"{self.table.place} begins at t = {first:.6g} s: {_FIRST_TIMES[bool(first > 0)]}"
             )
         rows["t"] = rows["t"] - first
+        self._note_start(rows)
         return self._checked(rows)
+
+    def _note_start(self, rows: dict[str, Any]) -> None:
+        """Note a start state of a message that is not that of the first sample, and a robot of another name."""
+        q, dq = (rows[kind] for kind in ("q", "dq"))
+        points = {
+            joint: (q[0, k], 0.0 if dq is None else dq[0, k])
+            for k, joint in enumerate(self.joints)
+        }
+        held = self.record.held_joints
+        points |= {joint: (position, 0.0) for joint, position in held.items()}
+        unplanned = [joint for joint in self.table.start if joint not in points]
+        texts = [f"{joint}, which is not planned" for joint in unplanned]
+        for joint, state in self.table.start.items():
+            for value, other in zip(state, points.get(joint, state), strict=True):
+                # nan is an unknown velocity.
+                if abs(value - other) > MAX_START_DIFFERENCE:
+                    texts.append(
+                        f"{joint} at {value:.6g}, where the motion has {other:.6g}"
+                    )
+        place = self.table.place
+        if texts:
+            listing = listed(texts, MAX_LISTED)
+            self.notes.append(f"{place}: the start state of the message has {listing}")
+        name = self.table.robot_name
+        actual = urdf_tree(self.record.urdf).get("name", "") if name else ""
+        if name != actual:
+            self.notes.append(
+                f"{place} is for the robot {name!r}, the URDF is that of {actual!r}: joints are matched by name"
+            )
 
     def _checked(self, rows: dict[str, Any]) -> Trajectory:
         """Return the trajectory of rows with parameters and scene, after a check of its units."""
@@ -120,7 +152,7 @@ class TableReader:
         time = self._time_column()
         unknown = self.options.rate is None and time is not None
         stated = not unknown or self._stated(time or "") is not None
-        if not stated:
+        if not stated or (self.lacks_joint_unit and not self.table.has_units):
             angle = self.options.unit or "rad"
             self.notes.append(
                 f"columns without a unit are read in s, {angle} and m, and their derivatives"
@@ -151,11 +183,8 @@ class TableReader:
         }
 
     def unused(self) -> list[str]:
-        """Return the names of the columns that were not read, except those of known other kinds."""
+        """Return the names of the columns and other elements that were not read."""
         names = [name for name in self.table.columns if name not in self.used]
-        names = [
-            name for name in names if not plain(name).lower().startswith(UNUSED_KINDS)
-        ]
         return [*names, *dict.fromkeys(self.other_joints), *self.table.unused]
 
     def _error(self, text: str, **details: Any) -> UsageError:
@@ -447,9 +476,9 @@ class TableReader:
             ("m", 1.0) if slides else turning for slides in self.record.prismatic_joints
         ]
         parts = list(zip(names, units, strict=True))
-        self.lacks_unit |= any(
-            stated_factor(name) is None and unit == "rad" for name, (unit, _) in parts
-        )
+        lacking = [unit for name, (unit, _) in parts if stated_factor(name) is None]
+        self.lacks_joint_unit |= bool(lacking)
+        self.lacks_unit |= "rad" in lacking
         return np.array(
             [
                 self._factor(name, unit + exponent, usual)

@@ -50,7 +50,14 @@ def read_text_table(path: Path, separator: str | None) -> TrajectoryTable:
     elif comment is not None:
         names = _cells(path, [comment], _separator_of(comment[1], separator))[0][1]
         head = names if len(names) == len(rows[0][1]) else None
-    names = [str(k) for k in range(len(rows[0][1]))] if head is None else head
+    width = len(rows[0][1] if head is None else head)
+    # A comma at the end of lines makes a column without a name.
+    names = [f"column {k}" for k in range(1, width + 1)]
+    names = (
+        [*map(str, range(width))]
+        if head is None
+        else [name or number for name, number in zip(head, names, strict=True)]
+    )
     _check(path, names, rows)
     return TrajectoryTable(
         str(path),

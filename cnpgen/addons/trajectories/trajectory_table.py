@@ -32,6 +32,10 @@ class TrajectoryTable:
         unused: Further elements of the file that are not read.
         held_joints: Positions of joints that are not planned [rad or m], if the file
             states them.
+        start: Positions and velocities (nan if unknown) of joints in the state that a
+            message starts from [rad or m, and 1/s].
+        robot_name: Name of the robot; empty if the file does not name it.
+        has_units: Whether the format defines the units of its columns.
     """
 
     place: str
@@ -41,3 +45,6 @@ class TrajectoryTable:
     has_head: bool = True
     unused: Names = ()
     held_joints: NamedNumbers = field(default_factory=dict)
+    start: Mapping[str, tuple[float, float]] = field(default_factory=dict)
+    robot_name: str = ""
+    has_units: bool = False

@@ -12,6 +12,8 @@ import pytest
 
 from cnpgen.cli.main import main
 from cnpgen.errors import UsageError
+from cnpgen.problems.problem_record import as_record, open_problem
+from cnpgen.robots.urdf import urdf_tree
 from cnpgen.trajectories import LoadOptions, load_trajectories
 from tests.addons.trajectories.test_table_columns import BACKWARDS, DQ, Q, T
 from tests.refusals import is_refused
@@ -146,6 +148,21 @@ JSON_CHANGES: list[tuple[str, Any, Callable[[Any], Any], str]] = [
             multi_dof_joint_state={"joint_names": ["world"]}
         ),
         "listed",
+    ),
+    (
+        "efforts",
+        MESSAGE,
+        lambda m: [point.update(effort=[1.0] * 6) for point in m["points"]],
+        "listed",
+    ),
+    ("few efforts", MESSAGE, lambda m: m["points"][3].update(effort=[1.0]), "refused"),
+    ("state efforts", STATES, lambda m: m[3].update(effort=[1.0] * 6), "listed"),
+    ("few in a state", STATES, lambda m: m[3].update(effort=[1.0]), "refused"),
+    (
+        "start of few joints",
+        RESULT,
+        lambda m: m["trajectory_start"]["joint_state"]["position"].pop(),
+        "refused",
     ),
     (
         "two times",
@@ -407,3 +424,104 @@ def test_attributes_of_the_names_of_joints_are_refused_or_listed(
         return
     with is_refused(UsageError, argument="path"):
         load_trajectories(path, "airhockey")
+
+
+@pytest.mark.parametrize(
+    ("changes", "note"),
+    [
+        ({}, ""),
+        ({"position": (Q[0] + 1e-6).tolist()}, ""),
+        (
+            {"position": (Q[0] + 0.2).tolist()},
+            "joint_1 at {0:.6g}, where the motion has {1:.6g}",
+        ),
+        ({"velocity": [0.5] * 6}, "joint_1 at 0.5, where the motion has 0"),
+        (
+            {
+                "name": [*JOINTS, "claw"],
+                "position": [*Q[0].tolist(), 0.0],
+                "velocity": [],
+            },
+            "claw, which is not planned",
+        ),
+    ],
+)
+def test_a_start_that_is_not_the_first_point_is_noted(
+    tmp_path: Path, changes: dict[str, Any], note: str
+) -> None:
+    document = copy.deepcopy(RESULT)
+    document["trajectory_start"]["joint_state"] |= {
+        "velocity": DQ[0].tolist()
+    } | changes
+    (tmp_path / "a.json").write_text(json.dumps(document))
+    notes = load_trajectories(tmp_path / "a.json", "airhockey").notes
+    expected = note.format(Q[0, 0] + 0.2, Q[0, 0]).removesuffix(" 0")
+    assert any(expected in each for each in notes) == bool(note), notes
+    assert any("the start state of the message" in each for each in notes) == bool(note)
+
+
+def test_the_first_of_several_trajectories_begins_at_the_start(tmp_path: Path) -> None:
+    parts = [
+        {"joint_trajectory": MESSAGE},
+        copy.deepcopy({"joint_trajectory": MESSAGE}),
+    ]
+    for point in parts[1]["joint_trajectory"]["points"]:
+        point["positions"][0] += 0.2
+    state = RESULT["trajectory_start"]
+    path = tmp_path / "a.json"
+    for order, noted in ((parts, False), (parts[::-1], True)):
+        document = {"trajectory_start": state, "trajectory": order}
+        path.write_text(json.dumps(document))
+        notes = load_trajectories(path, "airhockey").notes
+        assert any("start state" in note for note in notes) == noted
+
+
+@pytest.mark.parametrize("model", ["", "iiwa", "fetch"])
+def test_a_robot_of_another_name_is_noted(tmp_path: Path, model: str) -> None:
+    urdf = open_problem(as_record("airhockey"))[1].urdf_text
+    own = urdf_tree(urdf).get("name", "")
+    model = model.replace("iiwa", own)
+    path = tmp_path / "a.json"
+    path.write_text(json.dumps(RESULT | {"model_id": model}))
+    notes = load_trajectories(path, "airhockey").notes
+    text = f"is for the robot {model!r}, the URDF is that of {own!r}"
+    assert any(text in note for note in notes) == (model not in {"", own})
+
+
+def test_columns_without_a_name_are_listed_by_their_number(tmp_path: Path) -> None:
+    lines = [",".join(HEAD) + ","]
+    rows = np.column_stack([T, Q, DQ]).tolist()
+    lines += [",".join(map(repr, row)) + "," for row in rows]
+    path = tmp_path / "a.csv"
+    path.write_text("\n".join(lines))
+    loaded = load_trajectories(path, "airhockey")
+    assert loaded.ignored == (f"column {len(HEAD) + 1}",)
+
+
+@pytest.mark.parametrize(
+    ("time", "unit", "noted"),
+    [("t [s]", "", True), ("t", " [rad]", True), ("t [s]", " [rad]", False)],
+)
+def test_columns_without_a_unit_are_noted_each(
+    tmp_path: Path, time: str, unit: str, noted: bool
+) -> None:
+    head = ",".join([time, *(f"{joint}{unit}" for joint in JOINTS)])
+    path = tmp_path / "a.csv"
+    np.savetxt(path, np.column_stack([T, Q]), "%.17g", ",", header=head, comments="")
+    notes = load_trajectories(path, "airhockey").notes
+    text = "columns without a unit are read in s, rad and m"
+    assert any(text in note for note in notes) == noted
+    path = tmp_path / "a.json"
+    # Messages define their units.
+    path.write_text(json.dumps(MESSAGE))
+    assert not any(text in note for note in load_trajectories(path, "airhockey").notes)
+
+
+@pytest.mark.parametrize("kind", ["effort", "jerk"])
+def test_efforts_and_jerks_in_a_table_are_listed(tmp_path: Path, kind: str) -> None:
+    names = [f"{kind} joint_1", f"joint_2_{kind}"]
+    path = tmp_path / "a.csv"
+    rows = np.column_stack([T, Q, Q[:, :2]])
+    head = ",".join(["t", *JOINTS, *names])
+    np.savetxt(path, rows, "%.17g", ",", header=head, comments="")
+    assert load_trajectories(path, "airhockey").ignored == tuple(names)
