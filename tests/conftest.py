@@ -47,6 +47,7 @@ from cnpgen.pipelines.pipeline import Pipeline, load_pipeline
 from cnpgen.pipelines.prepared import PreparedPipeline, random_generator
 from cnpgen.pipelines.stages.stage import CandidateBatch
 from cnpgen.robots.robot import Robot
+from cnpgen.schema import entry_points
 from cnpgen.store.files.cache_folder import exclusive_lock, make_private_folder
 from cnpgen.store.layout import MANIFEST
 from tests import refusals
@@ -93,8 +94,19 @@ pytest_plugins = ["pytester"]
 Prepare = Callable[..., PreparedPipeline]
 
 
+def _ignore_installed_plugins() -> None:
+    """Read the entry points of cnpgen and of packages that a test installs, not of others on this machine."""
+    find = entry_points._metadata_files
+    foreign = {file for file in find() if not file.parent.name.startswith("cnpgen-")}
+    entry_points._metadata_files = lambda: (
+        file for file in find() if file not in foreign
+    )
+    entry_points.entry_points.cache_clear()
+
+
 def pytest_configure(config: pytest.Config) -> None:
     """Let the tests run where there is no compiler, every dataset then after a warning, and in the background."""
+    _ignore_installed_plugins()
     if (
         signal.getsignal(signal.SIGINT) is signal.SIG_IGN
     ):  # as shells start what runs in the background

@@ -361,6 +361,29 @@ def test_no_chunk_changes_a_motion_after_a_stop_in_any_order_of_requests():
     assert outcome.requests["chunk, STOPPED"] >= 2
 
 
+class QueueLock:
+    """A lock that threads get in the order in which they ask for it."""
+
+    def __init__(self):
+        self.changed, self.threads = threading.Condition(), []
+
+    def __enter__(self):
+        with self.changed:
+            self.threads.append(threading.current_thread())
+            self.changed.notify_all()
+            self.changed.wait_for(lambda: self.threads[0] is threading.current_thread())
+
+    def __exit__(self, *_):
+        with self.changed:
+            self.threads.pop(0)
+            self.changed.notify_all()
+
+    def wait_for(self, thread):
+        """Wait until a thread asks for the lock."""
+        with self.changed:
+            assert self.changed.wait_for(lambda: thread in self.threads, 60)
+
+
 def test_a_stop_that_is_being_computed_is_finished_before_the_runtime_resumes(
     planner, executing, monkeypatch
 ):
@@ -373,6 +396,8 @@ def test_a_stop_that_is_being_computed_is_finished_before_the_runtime_resumes(
         assert go_on.wait(60)
         return earliest_stop(*arguments, **named)
 
+    lock = QueueLock()
+    monkeypatch.setattr(executing, "_stopping", lock)
     monkeypatch.setattr(plan_runtime, "earliest_stop", slow)
     end, home, stops = executing.end_time, planner.robot.home, []
     threads = [
@@ -384,7 +409,7 @@ def test_a_stop_that_is_being_computed_is_finished_before_the_runtime_resumes(
     assert computing.wait(60)
     for thread in threads[1:]:
         thread.start()
-    time.sleep(0.1)
+        lock.wait_for(thread)
     assert threads[2].is_alive()
     assert executing.stopped
     go_on.set()
