@@ -9,9 +9,11 @@ from importlib import import_module
 from types import ModuleType
 from typing import Any
 
+from cnpgen.cli.parser import Parser, add_common
 from cnpgen.errors import CnpgenError, MachineError
 from cnpgen.schema import addons
-from cnpgen.schema.registry import COMMANDS
+from cnpgen.schema.entry_points import EntryPoint, entry_points
+from cnpgen.schema.registry import COMMANDS, PROJECT
 
 _CORE = {  # command -> module of cnpgen.cli, in the order of the help
     "make-dataset": "make_command",
@@ -51,36 +53,58 @@ def is_command(name: str) -> bool:
     )
 
 
-def load_command(name: str) -> ModuleType:
-    """Import the module of a command.
+def load_command(name: str) -> tuple[ModuleType, list[Any]]:
+    """Import the module of a command and its alternative inputs.
 
     Raises:
         MissingAddonError: The command belongs to an add-on that this installation
             lacks.
-        MachineError: The module of another package cannot be imported.
+        MachineError: The module of another package cannot be imported or has no
+            options, or several packages register the name.
     """
+    alternatives = [
+        _load(entry, name)
+        for entry in addons.installed(COMMANDS)
+        if entry.name.startswith(f"{name}.")
+    ]
     if name in _CORE:
-        return import_module(f"cnpgen.cli.{_CORE[name]}")
-    entry = addons.find(COMMANDS, name)
-    assert entry is not None, name
+        return import_module(f"cnpgen.cli.{_CORE[name]}"), alternatives
+    entries = [entry for entry in entry_points()[COMMANDS] if entry.name == name]
+    own = [entry for entry in entries if entry.distribution == PROJECT]
+    if len(entries) > 1 and not own:
+        packages = " and by ".join(entry.distribution for entry in entries)
+        raise MachineError(
+            f"the command {name!r} is defined more than once: by {packages}"
+        )
+    return _load((own or entries)[0], name), alternatives
+
+
+def unused_commands() -> list[str]:
+    """Return a sentence for each command of a package that has the name of one of cnpgen."""
+    entries = entry_points().get(COMMANDS, ())
+    own = {entry.name for entry in entries if entry.distribution == PROJECT}
+    return [
+        f"the command {entry.name!r} of the package {entry.distribution!r} is not used: cnpgen has one of that name"
+        for entry in entries
+        if entry.distribution != PROJECT and entry.name in own | _CORE.keys()
+    ]
+
+
+def _load(entry: EntryPoint, name: str) -> Any:
+    """Import a module of a command, and try the options of another package."""
     try:
-        module: ModuleType = addons.load_entry(entry, f"the command {name!r}")
+        module = addons.load_entry(entry, f"the command {name!r}")
+        if entry.distribution != PROJECT:
+            trial = Parser()
+            add_common(trial)
+            module.add_options(trial)
+            _ = module.run
     except CnpgenError:
         raise
     except Exception as error:
         # Modules of packages may raise any exception.
         text = f"{type(error).__name__}: {error}"
         raise MachineError(
-            f"the command {name!r} cannot be imported: {text}"
+            f"the command {name!r} of {entry.distribution or 'an installed package'} is faulty: {text}"
         ) from error
     return module
-
-
-def load_alternatives(name: str) -> list[Any]:
-    """Import the alternative inputs of a command."""
-    entries = [
-        entry
-        for entry in addons.installed(COMMANDS)
-        if entry.name.startswith(f"{name}.")
-    ]
-    return [addons.load_entry(entry, f"the command {name!r}") for entry in entries]

@@ -58,6 +58,7 @@ def machine_text(report: "MachineReport") -> str:
         "compiler": report.compiler or "none",
         "backend": f"{report.backend or 'none'}: {report.backend_reason}",
         "cache": f"{report.cache_folder} ({_cache(report)})",
+        "plug-ins": ", ".join(report.plugins) or "none",
         "recipes": report.recipes,
         "free disk": f"{report.free_bytes / 1e9:,.1f} GB here",
         "verdict": _verdict(report),

@@ -16,8 +16,8 @@ from cnpgen.cli import docs_command
 from cnpgen.cli.commands import (
     command_names,
     is_command,
-    load_alternatives,
     load_command,
+    unused_commands,
 )
 from cnpgen.cli.interruption import Terminated, exit_code, interruptible
 from cnpgen.cli.parser import Parser, add_command, add_common
@@ -182,14 +182,17 @@ def build_parser(names: Sequence[str] | None = None) -> Parser:
     )
     for name in command_names() if names is None else names:
         try:
-            module = load_command(name)
+            module, alternatives = load_command(name)
         except MachineError as error:
             # A command that is asked for must work; in a list of all it is only marked.
             if names is not None:
                 raise
             commands.add_parser(name, help=f"cannot be used: {error}")
         else:
-            add_command(commands, name, module, load_alternatives(name))
+            add_command(commands, name, module, alternatives)
+    if names is None:
+        for sentence in unused_commands():
+            warnings.warn(sentence, stacklevel=2)
     return parser
 
 

@@ -12,6 +12,7 @@ from cnpgen.robots.obstacle_shapes.obstacle_shape import (
     ObstacleShape,
     SizedShape,
     shape_class,
+    stated_polytope,
 )
 from cnpgen.robots.parameter_ranges import optional_key
 from cnpgen.robots.shape.hull import MAX_COORDINATE_M, check_solid
@@ -206,7 +207,7 @@ class Obstacle:
         if body is None:
             return
         try:
-            corners, radius = body.polytope()
+            corners, radius = stated_polytope(body)
             check_solid(corners)
         except ValueError as error:
             yield "mesh" if self.mesh else "shape", str(error)

@@ -10,15 +10,17 @@ import platform
 import shutil
 import sys
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 
 from cnpgen.documents import JsonObject
-from cnpgen.errors import PluginError, counted
+from cnpgen.errors import PluginError, RecipeError, counted, nearest
 from cnpgen.machine.threads import users_environment
 from cnpgen.machine.versions import installed_version, processor_entry
+from cnpgen.schema.entry_points import entry_points
 from cnpgen.schema.foreign_paths import foreign_path_hint
+from cnpgen.schema.registry import CONTRACTS, PROJECT, load
 
 REQUIRED_MODULES = (
     "numpy", "scipy", "casadi", "pinocchio", "coal", "h5py", "joblib", "psutil", "tqdm", "daqp", "threadpoolctl",
@@ -81,6 +83,7 @@ class MachineReport:
         cache_writable: Whether kernels can be cached.
         cache_used: Whether cached kernels are loaded; they are not if other users may
             change them.
+        plugins: Plug-ins of other packages, with their groups and packages.
         recipes: Number and folder of the recipes.
         free_bytes: Free disk space in the working directory [bytes]; 0 if it does not
             exist.
@@ -106,6 +109,7 @@ class MachineReport:
     cache_folder: str
     cache_writable: bool
     cache_used: bool
+    plugins: tuple[str, ...]
     recipes: str
     free_bytes: int
     problems: tuple[str, ...]
@@ -152,6 +156,7 @@ def check_machine() -> MachineReport:
         cache_folder=cache,
         cache_writable=writable,
         cache_used=cache_used,
+        plugins=tuple(_check_plugins(findings)),
         recipes=_check_recipes(findings),
         free_bytes=_check_disk(findings),
         problems=tuple(findings.problems),
@@ -344,6 +349,30 @@ def _check_cache(findings: _Findings, cache: str) -> bool:
             f" is {files[0]}"
         )
     return True
+
+
+def _check_plugins(findings: _Findings) -> Iterator[str]:
+    """List the plug-ins of other packages, and note those that nothing uses."""
+    found = [entry for entries in entry_points().values() for entry in entries]
+    # The groups of add-ons have entries of the project.
+    known = {
+        *CONTRACTS,
+        *(each.group for each in found if each.distribution == PROJECT),
+    }
+    for entry in found:
+        if entry.distribution == PROJECT:
+            continue
+        yield f"{entry.name} ({entry.group}) of {entry.distribution}"
+        if entry.group not in known:
+            findings.notes.append(
+                f"{entry.name!r} of the package {entry.distribution!r} is ignored: its entry point group"
+                f" {entry.group!r} is unknown{nearest(entry.group, known)}"
+            )
+        elif entry.group in CONTRACTS:
+            try:
+                load(entry.group, entry.name)
+            except RecipeError as error:
+                findings.notes += error.errors
 
 
 def _check_recipes(findings: _Findings) -> str:

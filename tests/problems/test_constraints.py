@@ -44,6 +44,7 @@ from cnpgen.schema.registry import CONSTRAINTS, load, names
 from cnpgen.world.world import World
 from tests.examples.constraints import TipSpeed as SpeedOfPlugin
 from tests.examples.shipped import PROBLEMS
+from tests.refusals import is_refused
 
 # Three sliding axes, a turn about z and a lean about x: what it holds is upright unless it leans.
 GANTRY_JOINTS = [
@@ -905,3 +906,8 @@ def test_tolerances_of_clearances_permit_no_penetration_of_links(constraint, exp
         "clearance", "m", [0.0, 0.0], np.zeros(2), np.full(2, np.inf), "position"
     )
     np.testing.assert_allclose(constraint.allowed(condition), expected, rtol=1e-12)
+
+
+def test_a_condition_of_an_unknown_kind_of_tolerance_is_refused() -> None:
+    with is_refused(ValueError):
+        Condition("speed", "m/s", [0.0], np.zeros(1), np.ones(1), "speed")

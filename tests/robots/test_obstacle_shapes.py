@@ -240,6 +240,30 @@ def test_polytopes_that_are_no_bodies_are_refused(
         problem.with_obstacles([obstacle])
 
 
+@pytest.mark.parametrize(
+    "polytope",
+    [
+        "[(0, 0, 0), (1, 0, 0), (0, 1, 0), (0, 0, 1)], 0.0",
+        "np.eye(3)",
+        "np.zeros((4, 2)), 0.0",
+        "np.eye(4, 3), None",
+        "np.random.default_rng().normal(size=(8, 3)), 0.0",
+        "np.eye(4, 3), np.random.default_rng().uniform()",
+    ],
+)
+def test_wrong_polytopes_of_packages_are_refused(
+    problem: Problem, monkeypatch: pytest.MonkeyPatch, polytope: str
+) -> None:
+    (obstacle,) = problem.obstacle
+    method = eval(f"lambda self: ({polytope})", {"np": np})
+    monkeypatch.setattr(type(obstacle.shape), "polytope", method)
+    with pytest.raises(
+        UsageError,
+        match=rf"of the package '{NAME}' returns .*array of corners of shape \(V, 3\)",
+    ):
+        problem.with_obstacles([replace(obstacle, name="other")])
+
+
 def test_scenes_refuse_the_shape_of_a_package(problem: Problem) -> None:
     scene = SceneProblem("one", problem.obstacle, np.zeros(4), np.zeros((1, 4)))
     with pytest.raises(UsageError, match="cone"):

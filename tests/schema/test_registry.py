@@ -5,6 +5,7 @@ from dataclasses import dataclass
 
 import pytest
 
+from cnpgen.cli import commands
 from cnpgen.cli.main import main
 from cnpgen.errors import RecipeError
 from cnpgen.machine.engine import ClusterEngine
@@ -58,10 +59,12 @@ def register(monkeypatch):
     """Return a function that installs entry points (group, name, value)."""
     entries: dict[str, tuple[EntryPoint, ...]] = {}
 
-    def add(group, name, value):
-        entries[group] = (*entries.get(group, ()), EntryPoint(group, name, value))
+    def add(group, name, value, package=""):
+        entry = EntryPoint(group, name, value, package)
+        entries[group] = (*entries.get(group, ()), entry)
 
     monkeypatch.setattr(addons, "entry_points", lambda: entries)
+    monkeypatch.setattr(commands, "entry_points", lambda: entries)
     monkeypatch.setattr(registry, "entry_points", lambda: entries)
     monkeypatch.setattr(
         registry,
@@ -218,4 +221,24 @@ def test_a_command_that_cannot_be_imported_does_not_hide_the_others(register, ca
     assert main(["--help"]) == 0
     assert re.search(r"    broken +cannot be used: ", capsys.readouterr().out)
     assert main(["broken"]) == 3
+    assert_said(capsys.readouterr().err)
+
+
+def test_a_command_without_options_does_not_hide_the_others(register, capsys):
+    register(registry.COMMANDS, "blank", "cnpgen.cli", "a-package")
+    assert main(["--help"]) == 0
+    captured = capsys.readouterr()
+    assert re.search(r"    blank +cannot be used: ", captured.out)
+    assert "\n    doctor " in captured.out
+    assert main(["blank"]) == 3
+    assert_said(capsys.readouterr().err)
+
+
+@pytest.mark.filterwarnings("default")
+def test_commands_of_one_name_are_refused_or_named(register, capsys):
+    for name, package in (("docs", "one"), ("twice", "one"), ("twice", "other")):
+        register(registry.COMMANDS, name, "cnpgen.cli.docs_command", package)
+    assert main(["--help"]) == 0
+    assert_said(capsys.readouterr().err)
+    assert main(["twice"]) == 3
     assert_said(capsys.readouterr().err)

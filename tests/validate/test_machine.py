@@ -21,6 +21,7 @@ from cnpgen.machine import threads
 from cnpgen.validate import machine
 from cnpgen.validate.machine import check_machine, vector_instructions
 from tests.conftest import needs_compiler
+from tests.examples.installed import installed_kind
 
 
 @pytest.fixture
@@ -39,6 +40,28 @@ def test_this_machine_has_no_problems():
     assert report.hdf5[0].isdigit()
     assert report.free_bytes > 0
     assert "13 datasets" in report.recipes
+
+
+@pytest.mark.parametrize(
+    ("group", "note"),
+    [
+        ("cnpgen.exportes", "did you mean 'cnpgen.exporters'"),
+        (
+            "cnpgen.exporters",
+            "exporter 'odd' of odd (no_such_module:X) cannot be imported",
+        ),
+    ],
+)
+def test_plugins_are_listed_and_those_without_use_are_noted(
+    tmp_path, monkeypatch, group, note
+):
+    assert check_machine().plugins == ()
+    with installed_kind(tmp_path, "odd", "no_such_module:X", monkeypatch, group=group):
+        report = check_machine()
+    assert report.ok
+    assert report.plugins == (f"odd ({group}) of odd",)
+    (text,) = (each for each in report.notes if "'odd'" in each)
+    assert note in text
 
 
 def test_every_dependency_is_checked():

@@ -53,7 +53,9 @@ class Condition:
         g: m values: SX scalars in the symbolic form, floats in the measured form.
         lower: Lower bounds, shape (m,), -inf for no bound.
         upper: Upper bounds, shape (m,); equal to ``lower`` for equalities.
-        tolerance: Key of ``BOUNDARY_TOLERANCES``, the tolerances of boundary states.
+        tolerance_kind: Kind of its tolerance on boundary states, a key of
+            ``BOUNDARY_TOLERANCES``: "limit", "position", "angle", "direction",
+            "velocity" or "acceleration".
         parts: Names of the m values; empty for numbered values.
         sufficient: Whether the condition is conservative: only the measured form can
             prove a violation.
@@ -72,6 +74,14 @@ class Condition:
     sufficient: bool = False
     accepted: Array | None = None
     projected: bool = False
+
+    def __post_init__(self) -> None:
+        """Refuse an unknown kind of tolerance."""
+        if self.tolerance_kind not in BOUNDARY_TOLERANCES["float64"]:
+            raise ValueError(
+                f"tolerance_kind of the condition {self.name!r} must be one of"
+                f" {', '.join(BOUNDARY_TOLERANCES['float64'])}, got {self.tolerance_kind!r}"
+            )
 
     @property
     def is_equality(self) -> bool:

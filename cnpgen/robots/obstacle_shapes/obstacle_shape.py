@@ -100,6 +100,38 @@ class ObstacleShape(ABC):
         return Element("mesh", filename=address_of(self.surface()))
 
 
+def _is_same(first: Any, second: Any) -> bool:
+    return np.array_equal(first, second, equal_nan=True)
+
+
+def stated_polytope(shape: ObstacleShape) -> tuple[Array, float]:
+    """Return the polytope of a shape of a package.
+
+    Raises:
+        ValueError: It is not an array of corners and a radius, or changes from call to
+            call.
+    """
+    found: Any = shape.polytope()
+    again: Any = shape.polytope()
+    match found:
+        case (np.ndarray() as corners, float() | int() | np.floating() as radius) if (
+            corners.ndim == 2
+            and corners.shape[1] == 3
+            and corners.dtype.kind in "fi"
+        ):
+            if all(map(_is_same, found, again)):
+                return corners, float(radius)
+            text = "a polytope that differs from call to call"
+        case _:
+            text = " ".join(f"{found!r:.80}".split())
+    kind = type(shape)
+    package = registry.package_of(registry.SHAPES, kind) or kind.__module__
+    expected = "expected the same array of corners of shape (V, 3) [m] and the same radius [m] from every call"
+    raise ValueError(
+        f"polytope() of {kind.__name__} of the package {package!r} returns {text}: {expected}"
+    )
+
+
 class SizedShape(ObstacleShape):
     """A shape whose sizes may differ from sample to sample, known to the compiled observations by a code."""
 
