@@ -160,16 +160,26 @@ def _scaled(source: LimitSource, scale: float) -> LimitSource:
 
 def _accelerations(problem: Problem, robot: Robot) -> LimitSource:
     """Return the source of limits by the rule of rate and cap, which a URDF 1.2 may narrow."""
-    if _rates(robot, "acceleration") == robot.acceleration_limit.tolist():
-        return LimitSource("urdf")
-    return LimitSource("guess", acceleration_rule(problem.limits))
+    rule, limits = acceleration_rule(problem.limits), robot.acceleration_limit
+    return _narrowed(robot, "acceleration", limits.tolist(), rule)
 
 
 def _jerks(robot: Robot) -> LimitSource:
     """Return the source of limits in proportion to accelerations, which a URDF 1.2 may narrow."""
-    if _rates(robot, "jerk") == robot.jerk_limit.tolist():
+    return _narrowed(robot, "jerk", robot.jerk_limit.tolist(), jerk_rule(JERK_RATE))
+
+
+def _narrowed(
+    robot: Robot, name: str, limits: Iterable[float], rule: str
+) -> LimitSource:
+    """Return the source of limits by a rule, of which some joints have those of the URDF."""
+    rates = zip(robot.joint_names, _rates(robot, name), limits, strict=True)
+    of_urdf = [joint for joint, rate, limit in rates if rate == limit]
+    if len(of_urdf) == len(robot.joint_names):
         return LimitSource("urdf")
-    return LimitSource("guess", jerk_rule(JERK_RATE))
+    stated = [f"the URDF for {', '.join(of_urdf)}"] if of_urdf else []
+    others = f"{rule} for the others" if of_urdf else rule
+    return LimitSource("guess", "; ".join([*stated, others]))
 
 
 def _rates(robot: Robot, name: str) -> list[float | None]:

@@ -20,6 +20,7 @@ from cnpgen.robots.robot_spec import Payload
 from cnpgen.robots.shape.shape import Shape
 from cnpgen.robots.urdf import number_in, urdf_tree
 from cnpgen.robots.urdf_parameters import (
+    LIMITED,
     NO_SOFT_LIMITS,
     UrdfJoint,
     UrdfParameters,
@@ -430,19 +431,24 @@ def attach(model: "pin.Model", attached: Attached) -> None:
 
 
 def bounded(urdf: str, tree: ElementTree.Element, attached: Attached) -> str:
-    """Return a URDF in which continuous joints with a given range are revolute.
+    """Return a URDF with complete limits, in which continuous joints with a given range are revolute.
 
-    The tree is modified in place.
+    Absent limits are zero, as in a URDF that states none. The tree is modified in
+    place.
     """
-    turning = [
-        joint for joint in tree.iter("joint") if joint.get("type") == "continuous"
-    ]
-    given = [joint for joint in turning if joint.get("name") in attached.ranges]
-    for joint in given:
-        joint.set("type", "revolute")
+    before = ElementTree.tostring(tree, encoding="unicode")
+    for joint in tree.iter("joint"):
+        turns = joint.get("type") == "continuous"
+        turns = turns and joint.get("name") in attached.ranges
+        if turns:
+            joint.set("type", "revolute")
         limit = joint.find("limit")
-        if limit is None:
-            limit = ElementTree.SubElement(joint, "limit", velocity="0", effort="0")
-        # These limits only make the element complete; ``attach`` sets the given range.
-        limit.attrib.update(lower="0", upper="0")
-    return ElementTree.tostring(tree, encoding="unicode") if given else urdf
+        if limit is None and joint.get("type") in LIMITED:
+            limit = ElementTree.SubElement(joint, "limit")
+        if limit is not None:
+            limit.attrib.update({"velocity": "0", "effort": "0"} | limit.attrib)
+        if limit is not None and turns:
+            # These limits only make the element complete; ``attach`` sets the range.
+            limit.attrib.update(lower="0", upper="0")
+    text = ElementTree.tostring(tree, encoding="unicode")
+    return urdf if text == before else text

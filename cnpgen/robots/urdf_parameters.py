@@ -26,8 +26,8 @@ _PARTS = {  # element -> the elements whose numbers are read
         *("dynamics", "safety_controller"),
     ),
 }
-_LIMITED = ("revolute", "prismatic")
-_TURNING_OR_SLIDING = (*_LIMITED, "continuous")
+LIMITED = ("revolute", "prismatic")  # joints that need a <limit>
+_TURNING_OR_SLIDING = (*LIMITED, "continuous")
 NO_SOFT_LIMITS = (-math.inf, math.inf)
 _ZERO = (0.0, 0.0, 0.0)
 MAX_RELATIVE_DIFFERENCE = 1e-9  # of values from two parsers, which round differently
@@ -235,7 +235,7 @@ def _joint(element: Element) -> UrdfJoint:
         rates=_rates(limit) if movable else {},
         damping=damping if movable else 0.0,
         friction=friction if movable else 0.0,
-        soft=_soft_limits(element) if kind in _LIMITED else NO_SOFT_LIMITS,
+        soft=_soft_limits(element) if kind in LIMITED else NO_SOFT_LIMITS,
     )
 
 

@@ -12,15 +12,17 @@ through the public interface.
 """
 
 import argparse
+import re
 import sys
 import warnings
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from cnpgen.cli.parser import Parser, refuse_others
 from cnpgen.cli.recipe_names import check_absent
-from cnpgen.errors import UsageError
+from cnpgen.errors import RecipeError, UsageError
 
 if TYPE_CHECKING:
     from cnpgen.addons.init.arm import Arm
@@ -76,7 +78,7 @@ def run(arguments: argparse.Namespace) -> None:
     arm, limits = _arm_and_limits(arguments)
     found = packages_of_environment(arm.meshes, arm.urdf, arguments.packages)
     packages = (*arguments.packages, *found)
-    with warnings.catch_warnings():
+    with warnings.catch_warnings(), _errors_of_input(folder, arm.urdf):
         # About the robot, which are in the notes.
         warnings.simplefilter("ignore", RuntimeWarning)
         initial = problem_of(
@@ -102,6 +104,25 @@ def run(arguments: argparse.Namespace) -> None:
         sep="\n  ",
         file=sys.stderr,
     )
+
+
+@contextmanager
+def _errors_of_input(folder: Path, urdf: Path) -> Iterator[None]:
+    """Name the URDF or an option in errors that would name a key of a recipe, which does not exist yet."""
+    try:
+        yield
+    except RecipeError as error:
+        texts = [
+            each.removeprefix(f"{(folder / 'problem.toml').absolute()}: ")
+            for each in error.errors
+        ]
+        for pattern, place in (
+            (r"^robot\.skipped_meshes", "--skip-mesh"),
+            (r"^robot\.joints", str(urdf)),
+            (r"skipped_meshes = \['(.*?)'\] in \[robot\]", r"--skip-mesh \1"),
+        ):
+            texts = [re.sub(pattern, place, text) for text in texts]
+        raise type(error)(texts) from error
 
 
 def _arm_and_limits(
@@ -148,8 +169,6 @@ def _write(folder: Path, texts: Mapping[str, str]) -> None:
 
 def _folder(name: str) -> Path:
     """Return the folder of recipes of a name, which may be a path."""
-    import re
-
     from cnpgen.schema.keys import NAME
     from cnpgen.store.files.atomic import check_writable
 

@@ -115,9 +115,7 @@ def stated_polytope(shape: ObstacleShape) -> tuple[Array, float]:
     again: Any = shape.polytope()
     match found:
         case (np.ndarray() as corners, float() | int() | np.floating() as radius) if (
-            corners.ndim == 2
-            and corners.shape[1] == 3
-            and corners.dtype.kind in "fi"
+            corners.ndim == 2 and corners.shape[1] == 3 and corners.dtype.kind in "fi"
         ):
             if all(map(_is_same, found, again)):
                 return corners, float(radius)

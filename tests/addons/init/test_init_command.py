@@ -258,12 +258,9 @@ def test_convex_parts_reject_less_than_two_percent_of_the_free_states(name, tmp_
             assert any(f"{pair.first}, {pair.second}" in note for note in initial.notes)
 
 
-def test_limits_that_are_missing_are_put_in_and_said(tmp_path):
-    joints = [
-        ("continuous", "0 0 1", ""),
-        ELBOW[1],
-        ("revolute", "0 1 0", '<limit velocity="0" effort="0"/>'),
-    ]
+@pytest.mark.parametrize("limit", ['<limit velocity="0" effort="0"/>', "<limit/>", ""])
+def test_limits_that_are_missing_are_put_in_and_said(tmp_path, limit):
+    joints = [("continuous", "0 0 1", ""), ELBOW[1], ("revolute", "0 1 0", limit)]
     urdf = write_arm(tmp_path / "arm.urdf", joints)
     assert main(["init", str(tmp_path / "bare"), "--urdf", str(urdf)]) == 0
     text = " ".join(
@@ -289,6 +286,24 @@ def test_limits_that_are_missing_are_put_in_and_said(tmp_path):
     assert limits.velocity == PerJoint((1.0, 2.0, 1.0))
     assert limits.torque.values[1] == 90
     assert min(limits.torque.values) >= 1
+
+
+def test_an_absent_limit_without_a_placeholder_names_its_joint(tmp_path, capsys):
+    urdf = write_arm(tmp_path / "arm.urdf", ELBOW)
+    assert main(["init", str(tmp_path / "bare"), "--urdf", str(urdf)]) == 0
+    urdf.write_text(urdf.read_text().replace(' effort="90"', "", 1))
+    capsys.readouterr()
+    assert main(["show", str(tmp_path / "bare" / "problem.toml")]) == 2
+    assert "joint_1: the torque limit must be positive" in capsys.readouterr().err
+
+
+def test_errors_name_the_urdf_or_an_option(tmp_path, capsys):
+    urdf, place = write_crane(tmp_path), tmp_path / "mine"
+    said = refused(capsys, 2, place, "--urdf", urdf, "--skip-mesh", "no-link")
+    assert said.startswith("cnpgen: error: --skip-mesh: the URDF has no link")
+    other = write_arm(tmp_path / "other.urdf", [*ELBOW[:2], ("floating", "0 0 1", "")])
+    said = refused(capsys, 2, place, "--urdf", other)
+    assert said.startswith(f"cnpgen: error: {other}: 'joint_3' is a floating joint")
 
 
 def test_jerks_are_limited_in_proportion_to_the_accelerations(crane):
