@@ -17,9 +17,13 @@ from cnpgen.cli import recipe_names, values, verdict_text
 from cnpgen.cli.parser import EXTRAPOLATE, Parser, add_json, refuse
 from cnpgen.cli.terminal import Meter
 from cnpgen.errors import DatasetError, UsageError, counted
+from cnpgen.schema import addons
+from cnpgen.schema.registry import COMMANDS
 
 if TYPE_CHECKING:
     from cnpgen.plans.evaluate import Evaluation
+
+_PLAN_SUFFIXES = {"", ".h5", ".hdf5"}  # other files hold sampled trajectories
 
 
 def add_options(parser: Parser) -> None:
@@ -85,6 +89,9 @@ def refuse_without_effect(arguments: argparse.Namespace) -> None:
 def _evaluate(arguments: argparse.Namespace) -> "Evaluation":
     from cnpgen.plans.evaluate import evaluate_plans
 
+    trajectories = addons.find(COMMANDS, "evaluate.trajectories")
+    if trajectories and arguments.file.suffix.lower() not in _PLAN_SUFFIXES:
+        addons.load_entry(trajectories, f"'cnpgen evaluate {arguments.file}'")
     plans = recipe_names.read_plans(
         arguments.file, problem=arguments.problem, extrapolate=arguments.extrapolate
     )

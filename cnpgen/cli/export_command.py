@@ -155,6 +155,11 @@ def _place(arguments: argparse.Namespace, exporter: "Exporter") -> Path:
     out: Path = arguments.out or Path(name)
     if not out.parent.is_dir():
         raise UsageError(f"{out} must be in a folder that exists")
+    is_file = exporter.single_file and not exporter.is_folder and not out.is_dir()
+    if is_file and not out.name.endswith(exporter.suffix):
+        raise UsageError(
+            f"-o {out}: {arguments.to} writes a file whose name ends with {exporter.suffix}, expected {out}{exporter.suffix}"
+        )
     check_writable(out)
     return out
 

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from cnpgen.arrays import Array
-from cnpgen.errors import DatasetError, RecipeError, UsageError, counted
+from cnpgen.errors import DatasetError, MachineError, RecipeError, UsageError, counted
 from cnpgen.plans.exporter import ExportedSet, Exporter, SampledPlan, sample_plan
 from cnpgen.plans.format import PlanStatus
 from cnpgen.plans.join import JoinedPlans
@@ -131,10 +131,19 @@ def export_plans(
         _exported_set(plans, kept, exporter), rate=rate, has_drives=drive is not None
     )
     files, held = _write(exporter, out, sampled, exported, force=force)
+    _check_written(files, exporter, to)
     invalid = tuple(
         index for index in kept if plans.status[index] == PlanStatus.INVALID
     )
     return Exported(tuple(files), len(kept), refused, invalid, held)
+
+
+def _check_written(files: Sequence[Path], exporter: Exporter, to: str) -> None:
+    if missing := [file for file in files if not file.exists()]:
+        package = registry.package_of(registry.EXPORTERS, type(exporter))
+        raise MachineError(
+            f"the exporter {to!r} of the package {package!r} has not written {missing[0]}"
+        )
 
 
 def _exported_set(

@@ -63,7 +63,12 @@ class Obstacle:
         choices=("", "start", "goal"),
         default="",
     )
-    kind: str = optional_key("kind of the obstacle", choices=_KINDS, default="box")
+    kind: str = optional_key(
+        "kind of the obstacle",
+        choices=_KINDS,
+        default="box",
+        form='a shape of a package: kind = "convex" and shape = {use = NAME}',
+    )
     position: Vector3 | None = optional_key(
         "position of the centre, for a mesh of the origin of its file: x, y, z",
         unit="m",

@@ -64,7 +64,8 @@ def field(
         choices: Allowed strings.
         pattern: Regular expression that a string, or the names in a table of integers,
             must match.
-        form: Notation of the value, if the type does not determine it.
+        form: Notation of the value, if the type does not determine it; beside choices
+            a remark on them.
         since_version: First version of the recipe schema with this key. Keys of
             versions later than 1 are omitted from records at their default, so that
             digests of older recipes stay the same.
@@ -117,7 +118,8 @@ class Key:
     def expected(self) -> str:
         """Short description of valid values: ``"a range, each end a length [m]"``."""
         if self.choices:
-            return "one of " + ", ".join(show(choice) for choice in self.choices)
+            choices = "one of " + ", ".join(show(choice) for choice in self.choices)
+            return "; ".join(filter(None, (choices, self.form)))
         return self.form or _expected(self.hint, self.unit)
 
 

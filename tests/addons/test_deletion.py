@@ -108,6 +108,21 @@ def test_without_an_addon_the_others_work_and_its_commands_name_it(
         )
 
 
+@pytest.mark.parametrize(
+    "without", [("trajectories",)], ids=["trajectories"], indirect=True
+)
+def test_a_file_that_only_a_missing_addon_reads_names_it(
+    without: Path, tmp_path: Path
+) -> None:
+    (tmp_path / "samples.csv").write_text("t,a\n0,1\n")
+    code, _, errors = run(without, "evaluate", "samples.csv", cwd=tmp_path)
+    assert code == 3
+    assert errors == (
+        "cnpgen: error: 'cnpgen evaluate samples.csv' needs the add-on 'trajectories',"
+        " which this installation lacks: reinstall cnpgen\n"
+    )
+
+
 @pytest.mark.parametrize("without", [("online",)], ids=["online"], indirect=True)
 def test_a_public_name_of_a_missing_addon_is_one_sentence(without: Path) -> None:
     program = (

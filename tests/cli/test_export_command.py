@@ -195,6 +195,15 @@ def test_a_place_in_a_folder_that_does_not_exist_is_refused(
     assert not Path("no").exists()
 
 
+def test_a_file_without_the_suffix_of_its_format_is_refused(
+    run: Run, hits: Path
+) -> None:
+    code, _, err = run(hits, "--to", "npz", "-o", "out")
+    assert code == 2
+    assert "expected out.npz" in err
+    assert not Path("out").exists()
+
+
 def test_an_empty_folder_is_free(run: Run, hits: Path) -> None:
     Path("empty").mkdir()
     assert run(hits, "--to", "csv", "-o", "empty", "--plan", 0)[0] == 0

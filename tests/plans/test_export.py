@@ -384,6 +384,24 @@ def test_a_format_with_a_file_per_plan_finds_its_folder(
     assert all(path.is_file() for path in exported.files)
 
 
+def test_an_exporter_that_writes_nothing_is_named(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    body = EXPORTER.partition("        path.write_text")[0]
+    (tmp_path / "silent.py").write_text(body + "        pass\n")
+    with (
+        installed_kind(
+            tmp_path,
+            "silent",
+            "silent:Durations",
+            monkeypatch,
+            group=registry.EXPORTERS,
+        ),
+        is_refused(MachineError),
+    ):
+        export_plans(draw_plans(), tmp_path / "out.txt", to="silent")
+
+
 def test_an_error_in_a_package_names_it(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

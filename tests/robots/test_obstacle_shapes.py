@@ -205,6 +205,14 @@ def test_wrong_tables_are_refused(problem: Problem, tmp_path: Path) -> None:
         assert any(key in text for text in error.value.errors), error.value.errors
 
 
+def test_an_unknown_kind_is_refused_with_how_to_use_shapes_of_packages(
+    tmp_path: Path,
+) -> None:
+    table = write_problem(tmp_path, obstacles=TABLE.replace('"convex"', '"wedge"'))
+    with pytest.raises(RecipeError, match=r"kind = .convex. and shape = "):
+        load_problem(table)
+
+
 @pytest.mark.parametrize(
     ("name", "value"), [("radius", np.nan), ("top_radius", -0.1), ("length", 1e9)]
 )

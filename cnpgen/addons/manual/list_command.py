@@ -19,7 +19,7 @@ _HOW = {
     "objectives": "cnpgen train DIR -o MODEL --objective NAME=WEIGHT",
     "exporters": "cnpgen export PLANS --to NAME",
     "families": "cnpgen make-scenes NAME --robot ROBOT",
-    "shapes": "kind = NAME in [[obstacle]]; of packages shape = {use = NAME}",
+    "shapes": 'kind = NAME in [[obstacle]]; of packages kind = "convex" and shape = {use = NAME}',
     "planners": "cnpgen benchmark SUITE --planners NAME",
     "suites": "cnpgen benchmark NAME",
 }
