@@ -119,7 +119,7 @@ class Key:
         """Short description of valid values: ``"a range, each end a length [m]"``."""
         if self.choices:
             choices = "one of " + ", ".join(show(choice) for choice in self.choices)
-            return "; ".join(filter(None, (choices, self.form)))
+            return f"{choices} ({self.form})" if self.form else choices
         return self.form or _expected(self.hint, self.unit)
 
 

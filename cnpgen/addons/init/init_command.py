@@ -20,7 +20,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from cnpgen.cli.parser import Parser, refuse_others
+from cnpgen.cli.parser import Parser, refuse, refuse_others
 from cnpgen.cli.recipe_names import check_absent
 from cnpgen.errors import RecipeError, UsageError
 
@@ -76,6 +76,9 @@ def run(arguments: argparse.Namespace) -> None:
         return
     check_absent(folder, FILES, force=arguments.force)
     arm, limits = _arm_and_limits(arguments)
+    if not arm.has_shape:
+        text = "{} has no effect: no link that planned joints move has a <collision> element"
+        refuse(arguments, ["skip_mesh", "srdf"], text)
     found = packages_of_environment(arm.meshes, arm.urdf, arguments.packages)
     packages = (*arguments.packages, *found)
     with warnings.catch_warnings(), _errors_of_input(folder, arm.urdf):

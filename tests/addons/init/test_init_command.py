@@ -306,6 +306,13 @@ def test_errors_name_the_urdf_or_an_option(tmp_path, capsys):
     assert said.startswith(f"cnpgen: error: {other}: 'joint_3' is a floating joint")
 
 
+@pytest.mark.parametrize("option", ["--skip-mesh", "--srdf"])
+def test_options_of_shapes_are_refused_for_an_arm_without_any(tmp_path, capsys, option):
+    urdf = write_arm(tmp_path / "arm.urdf", ELBOW)
+    said = refused(capsys, 2, tmp_path / "mine", "--urdf", urdf, option, "link_1")
+    assert f"{option} has no effect" in said
+
+
 def test_jerks_are_limited_in_proportion_to_the_accelerations(crane):
     problem = load_problem(crane / "problem.toml")
     robot = load_robot(problem)
