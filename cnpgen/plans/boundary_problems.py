@@ -6,23 +6,27 @@ Rows of a certified dataset have motions.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from cnpgen.arrays import AnyArray, Columns, Integers
+from cnpgen.documents import Names
 from cnpgen.errors import DatasetError, UsageError, lacks
 from cnpgen.plans.format import (
     ATTRIBUTES,
     CONDITIONS,
     FORMAT,
     GOAL_OPTION,
+    JOINT_NAMES,
     PLAN_FILE_VERSION,
     SI_UNITS,
     refuse_misspelt,
+    refuse_other_joints,
     report_unused,
+    stated_joints,
 )
 from cnpgen.plans.plan_file import agreed_problem, errors_of_file, stored_problem
 from cnpgen.plans.plans import Plans, make_plans
@@ -59,13 +63,15 @@ SAID = (*ATTRIBUTES, *_OF_SHARDS)  # attributes
 class BoundaryFile:
     """Present attributes of ``SAID`` and columns of ``ASKED`` in a file of N boundary problems; only names are checked.
 
-    ``has_checksum`` is whether the file has a checksum, which was verified.
+    ``has_checksum`` is whether the file has a checksum, which was verified. ``joints``
+    are the names of joints that a file of other software states: place -> names.
     """
 
     path: Path
     attributes: Mapping[str, Any]
     columns: Mapping[str, AnyArray]
     has_checksum: bool
+    joints: Mapping[str, Names] = field(default_factory=dict)
 
     @property
     def is_shard(self) -> bool:
@@ -199,7 +205,9 @@ def read_boundary_file(path: Path) -> BoundaryFile:
             # Files of cnpgen are complete.
             refuse_misspelt(path, names, ASKED)
             refuse_other_units(file, {name: SI_UNITS.get(name, "") for name in ASKED})
-            report_unused(path, file, SAID, ASKED)
+            known = *SAID, JOINT_NAMES
+            report_unused(path, file, known, (*ASKED, JOINT_NAMES))
+            found = replace(found, joints=stated_joints(file))
     found.check_shard()
     missing = [name for name in ("start_q", "goal_q") if name not in columns]
     if missing:
@@ -369,6 +377,7 @@ def _of_file(
         raise DatasetError(
             f"{path} is of another problem than {problem.name!r}: its problem_sha256 is not this one's"
         )
+    refuse_other_joints(path, file.joints, problem.joint_names)
     # Parked obstacles would be planned around in place of those of the samples.
     file.check_obstacles(problem)
     boundary = file.boundary(

@@ -2,10 +2,12 @@
 
 import difflib
 import logging
-from collections.abc import Collection
+import re
+from collections.abc import Collection, Mapping
 from enum import IntEnum
 from pathlib import Path
 
+from cnpgen.documents import Names
 from cnpgen.errors import DatasetError, listed
 from cnpgen.plans.stated_units import UNIT_ATTRIBUTES
 from cnpgen.store.field import Field
@@ -36,6 +38,7 @@ ATTRIBUTES = (
 
 # Of the metadata of exported Parquet tables, as JSON.
 
+JOINT_NAMES = "joint_names"  # in files of other software
 JOINT_NAMES_KEY = b"cnpgen_joint_names"
 PLAN_COLUMN = "plan"  # of exported tables with several plans: the index of the plan
 PHASE_COLUMN = "path_phase"  # of exported tables: the phase of each sample
@@ -128,7 +131,7 @@ MAX_LISTED = 12  # unused elements in a message
 _DESCRIBING = {
     *UNIT_ATTRIBUTES,
     *("long_name", "names", "frame", "role", "valid_min", "valid_max"),
-    *("flag_values", "flag_meanings"),
+    *("flag_values", "flag_meanings", JOINT_NAMES),
 }
 _LOG = logging.getLogger(__name__)
 KNOWN = frozenset(plan_fields((), ()))  # names with a fixed definition
@@ -166,11 +169,46 @@ def report_unused(
         f"attribute {key} of {name}"
         for name in file
         if name in names
-        for key in file[name].attributes
+        for key in file.attributes_of(name)
         if key not in _DESCRIBING
     ]
     if unused:
         _LOG.info("%s: not used: %s", path, listed(unused, MAX_LISTED))
+
+
+def stated_joints(file: Hdf5) -> dict[str, Names]:
+    """Return the names of joints that a file states, in the order of its columns: place -> names.
+
+    They are attributes of the file or of columns with one value per joint, texts or
+    lists, or a dataset of texts.
+    """
+    columns = [name for name in (*REQUIRED, "goal_ddq") if name in file]
+    found = {
+        f"{key} of {name}": attributes.texts(key)
+        for name in columns
+        if name != "rate_control_points"
+        for attributes in (file.attributes_of(name),)
+        for key in ("names", JOINT_NAMES)
+        if key in attributes
+    }
+    if JOINT_NAMES in file.attributes:
+        found[f"the attribute {JOINT_NAMES}"] = file.attributes.texts(JOINT_NAMES)
+    if JOINT_NAMES in file:
+        found[JOINT_NAMES] = file.texts(JOINT_NAMES)
+    # One text is a list in JSON, or separated by commas or spaces.
+    return {
+        place: tuple(re.findall(r"[^][\",\s]+", texts[0])) if len(texts) == 1 else texts
+        for place, texts in found.items()
+    }
+
+
+def refuse_other_joints(path: Path, stated: Mapping[str, Names], joints: Names) -> None:
+    """Raise DatasetError for columns of other joints than those of the problem, or in another order."""
+    for place, names in stated.items():
+        if names != joints:
+            raise DatasetError(
+                f"{path}: {place} is {', '.join(names)}, expected the problem's order, {', '.join(joints)}"
+            )
 
 
 class PlanStatus(IntEnum):

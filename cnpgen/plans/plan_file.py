@@ -24,6 +24,7 @@ from cnpgen.plans.format import (
     FLOATS,
     FORMAT,
     INTEGERS,
+    JOINT_NAMES,
     KNOWN,
     NOTES,
     PLAN_FILE_VERSION,
@@ -32,7 +33,9 @@ from cnpgen.plans.format import (
     PlanStatus,
     plan_fields,
     refuse_misspelt,
+    refuse_other_joints,
     report_unused,
+    stated_joints,
 )
 from cnpgen.plans.plans import Plans, make_plans
 from cnpgen.plans.stated_units import refuse_other_units
@@ -97,12 +100,14 @@ def load_plans(
         attributes = file.attributes.some((*ATTRIBUTES, *NOTES))
         _check_format(path, attributes)
         columns = _columns(path, file)
+        joints = {} if has_checksum else stated_joints(file)
         if not has_checksum:
             # Files of cnpgen have the names and units of the format; others may have
             # misspelled optional ones.
             refuse_misspelt(path, columns, CONDITIONS)
             refuse_other_units(file, SI_UNITS)
-            report_unused(path, file, (*ATTRIBUTES, *NOTES), columns)
+            read = *ATTRIBUTES, *NOTES, JOINT_NAMES
+            report_unused(path, file, read, columns)
     record = agreed_problem(
         path,
         stored_problem(path, attributes, required=wanted is None),
@@ -111,6 +116,7 @@ def load_plans(
         command="evaluate",
         parameters=columns.get("parameters", ()) if extrapolate else None,
     )
+    refuse_other_joints(path, joints, record.joint_names)
     with errors_of_file(path):
         plans = _assembled(path, record, columns, attributes)
     return correct_tips(replace(plans, has_checksum=has_checksum), where=f"{path}: ")

@@ -1,5 +1,6 @@
 """Attributes of files of other software: units, scales and misspelt names are refused, others are listed."""
 
+import json
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -94,3 +95,47 @@ def test_datasets_beside_boundary_conditions_are_listed(
     caplog.set_level("INFO", "cnpgen")
     read(tmp_path / "a.h5")
     assert "not used: velocity_limits" in caplog.text
+
+
+OWN = [f"joint_{k}" for k in range(1, 7)]
+
+
+@pytest.mark.parametrize(
+    ("names", "agrees"),
+    [(OWN, True), (OWN[::-1], False), (OWN[:5], False), ([*OWN[:5], "claw"], False)],
+)
+@pytest.mark.parametrize("form", [list, ",".join, " ".join, json.dumps])
+@pytest.mark.parametrize("place", ["", "start_q", "goal_q"])
+@pytest.mark.parametrize("kind", ["plans", "boundary"])
+def test_joints_in_another_order_are_refused(
+    tmp_path: Path,
+    kind: str,
+    place: str,
+    form: Callable[[list[str]], Any],
+    names: list[str],
+    agrees: bool,
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    columns, read = READERS[kind]
+    with write(tmp_path / "a.h5", columns) as file:
+        item = file[place] if place else file
+        item.attrs["joint_names"] = form(names)
+        if place:
+            item.attrs["names"] = form(names)
+    caplog.set_level("INFO", "cnpgen")
+    if agrees:
+        assert len(read(tmp_path / "a.h5")) == 2
+        assert "not used" not in caplog.text
+        return
+    text = f"is {', '.join(names)}, expected the problem's order, {', '.join(OWN)}"
+    with pytest.raises(DatasetError, match=text):
+        read(tmp_path / "a.h5")
+
+
+def test_a_dataset_of_joints_in_another_order_is_refused(tmp_path: Path) -> None:
+    columns, read = READERS["boundary"]
+    write(tmp_path / "a.h5", columns | {"joint_names": OWN}).close()
+    assert len(read(tmp_path / "a.h5")) == 2
+    write(tmp_path / "b.h5", columns | {"joint_names": OWN[::-1]}).close()
+    with pytest.raises(DatasetError, match="joint_names is joint_6, joint_5"):
+        read(tmp_path / "b.h5")
