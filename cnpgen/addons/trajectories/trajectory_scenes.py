@@ -6,6 +6,7 @@ constraints of the path.
 
 from __future__ import annotations
 
+import logging
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import replace
@@ -37,7 +38,7 @@ from cnpgen.problems.problem_record import (
     as_record,
     record_problem,
 )
-from cnpgen.problems.scenes.placement import placed_scene
+from cnpgen.problems.scenes.placement import placed_scene, warn_of_another_robot
 from cnpgen.problems.scenes.requested_problem import requested_problem
 from cnpgen.problems.scenes.scene_problem import SceneProblem, check_scenes
 from cnpgen.problems.scenes.scene_reader import (
@@ -57,6 +58,7 @@ from cnpgen.store.files.kind import PLANS
 from cnpgen.store.paths import file_kind
 from cnpgen.store.scene_table import OBSTACLE_POSES
 
+_LOG = logging.getLogger(__name__)
 MAX_ROUNDING = 1e-6  # of poses and sizes in float32
 _KINDS: tuple[Kind, ...] = ("problem", "pipeline", "dataset")
 
@@ -170,12 +172,19 @@ def _of_problems(
     problem: Problem, scenes: Sequence[SceneProblem]
 ) -> tuple[Problem, Array]:
     """Return the problem with the demands of scenes and their capacity, and the poses of their obstacles, (N, width)."""
+    _LOG.info(
+        "not used of the scenes: their goals, and their starts but for frames of links: the motions have ends of their own"
+    )
     if any(each.request.places or each.request.changes_problem for each in scenes):
         robot = load_robot(problem)
         placed_scenes = [
             placed_scene(each, robot, start_state(each, robot)) for each in scenes
         ]
         problem, _, scenes = requested_problem(problem, robot, placed_scenes)
+    elif any(each.request.robot_name for each in scenes):
+        robot = load_robot(problem)
+        for each in scenes:
+            warn_of_another_robot(each, robot)
     own = problem.with_obstacles(problem.own_obstacles)
     capacity = Counter(map(shape_of, _parked(problem))) | Counter(capacity_of(scenes))
     placed = with_capacity(own, capacity)

@@ -55,7 +55,7 @@ def placed_scene(scene: SceneProblem, robot: Robot, start: Array) -> SceneProble
         text = f"must have {robot.n} finite joint positions for {scene.place}, got {q.tolist()!r:.80}"
         raise UsageError(text, argument="start")
     request = scene.request
-    _warn_of_another_robot(scene, robot)
+    warn_of_another_robot(scene, robot)
     if not request.places:
         return scene
     frames = LinkFrames(scene, robot, q)
@@ -249,7 +249,7 @@ def _in_link(
     return replace(item, shapes=tuple(shapes), frames=(item.link,) * len(item.shapes))
 
 
-def _warn_of_another_robot(scene: SceneProblem, robot: Robot) -> None:
+def warn_of_another_robot(scene: SceneProblem, robot: Robot) -> None:
     """Warn if the scene names another robot than the URDF."""
     expected = scene.request.robot_name
     actual = urdf_tree(robot.urdf_text).get("name", "") if expected else ""

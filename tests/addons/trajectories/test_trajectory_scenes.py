@@ -225,6 +225,22 @@ def test_demands_of_requests_hold_for_trajectories(
     assert [each.reason for each in found.verdicts] == [reason] * 2
 
 
+@pytest.mark.parametrize("name", ["", "panda", "fetch"])
+@pytest.mark.parametrize("scale", [1.0, 0.5])
+def test_scenes_of_another_robot_are_a_warning_and_their_ends_are_listed(
+    files: tuple[Path, Path],
+    name: str,
+    scale: float,
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    caplog.set_level("INFO", "cnpgen")
+    scenes = [demanding(robot_name=name, velocity_scale=scale)]
+    load_trajectories(files[0], "panda-3kg", scenes=scenes)
+    text = f"is for the robot {name!r}, the URDF is that of 'panda'"
+    assert caplog.text.count(text) == (name == "fetch")
+    assert "not used of the scenes: their goals, and their starts" in caplog.text
+
+
 def test_attached_objects_of_scenes_collide_along_trajectories(
     files: tuple[Path, Path],
 ) -> None:
