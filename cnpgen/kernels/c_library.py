@@ -64,13 +64,12 @@ class Variant:
         return f"-mcpu={self.zig}" if is_zig else f"-march={self.name}"
 
 
+_AVX2 = frozenset({"avx2", "fma", "bmi1", "bmi2", "f16c", "abm", "movbe"})
+_AVX512 = frozenset({f"avx512{part}" for part in ("f", "bw", "cd", "dq", "vl")})
 VARIANTS = {  # of each architecture, the fastest first
     "x86_64": (
-        Variant(
-            "x86-64-v3",
-            "x86_64_v3",
-            frozenset({"avx2", "fma", "bmi1", "bmi2", "f16c", "abm", "movbe"}),
-        ),
+        Variant("x86-64-v4", "x86_64_v4", _AVX2 | _AVX512),
+        Variant("x86-64-v3", "x86_64_v3", _AVX2),
         Variant("x86-64", "x86_64"),
     ),
     "aarch64": (Variant("armv8-a", "generic"),),

@@ -138,6 +138,10 @@ def test_a_built_library_that_cannot_be_loaded_is_compiled_again(
 @pytest.mark.parametrize(
     ("flags", "names"),
     [
+        (
+            "avx avx2 fma bmi1 bmi2 f16c abm movbe avx512f avx512bw avx512cd avx512dq avx512vl",
+            ["x86-64-v4", "x86-64-v3", "x86-64"],
+        ),
         ("sse2 avx avx2 fma bmi1 bmi2 f16c abm movbe", ["x86-64-v3", "x86-64"]),
         ("sse2 avx avx2 bmi1 bmi2 f16c abm movbe", ["x86-64"]),
         ("", ["x86-64"]),
