@@ -332,4 +332,6 @@ def _wording(
 ) -> None:
     """Give ``is_refused`` the snapshots of the running test."""
     refusals.RunningTest.texts = snapshot.use_extension(refusals.Wording)
-    refusals.RunningTest.base = tmp_path_factory.getbasetemp()
+    base = tmp_path_factory.getbasetemp()
+    is_worker = base.name.startswith("popen-gw")
+    refusals.RunningTest.base = base.parent if is_worker else base

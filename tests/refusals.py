@@ -28,7 +28,8 @@ class RunningTest:
 
     Attributes:
         texts: Its stored texts, set by tests/conftest.py, as the next one.
-        base: Folder for the folders of tests, which pytest or a worker of it chose.
+        base: Folder for the folders of tests, which pytest chose; workers of it have
+            folders of their own there.
     """
 
     texts: SnapshotAssertion
@@ -49,7 +50,8 @@ class Wording(AmberSnapshotExtension):
 
 def portable(text: str) -> str:
     """Replace the folders of a machine, and digests, in a text."""
-    text = re.sub(rf"{re.escape(str(RunningTest.base))}/[^/\s'\",:)]+", "TEST", text)
+    base = re.escape(str(RunningTest.base))
+    text = re.sub(rf"{base}(/popen-gw\d+)?/[^/\s'\",:)]+", "TEST", text)
     return DIGEST.sub("DIGEST", text.replace(ROOT, "ROOT"))
 
 
