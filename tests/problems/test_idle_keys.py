@@ -94,7 +94,7 @@ def problem_of(
     return load_problem(file)
 
 
-def is_refused(
+def refuses_key(
     folder: Path, tables: dict[str, str], kind: str, key: str, urdf: str = "soft-limits"
 ) -> bool:
     """Return whether a problem is refused, by the name of a key."""
@@ -147,7 +147,7 @@ def test_a_key_is_named_if_and_only_if_it_changes_no_condition(
         payload = {"payload": BESIDE[name]} if name in BESIDE else {}
         both.append({**drive, **payload, table: text})
     urdf = "damping" if name == "drive.urdf_dynamics" else "soft-limits"
-    if any(is_refused(tmp_path, tables, kind, key, urdf) for tables in both):
+    if any(refuses_key(tmp_path, tables, kind, key, urdf) for tables in both):
         return
     problems = [problem_of(tmp_path, tables, kind, urdf) for tables in both]
     before, after = map(values_of, problems)
@@ -244,7 +244,7 @@ def test_every_parameter_is_refused_or_named_without_its_constraint(
 ) -> None:
     for key in keys(ParameterRanges):
         tables = {"parameters": f"{key.name} = [0.1, 0.2]", "payload": "mass = 0.15"}
-        if not is_refused(tmp_path, tables, "position", "parameters"):
+        if not refuses_key(tmp_path, tables, "position", "parameters"):
             problem = problem_of(tmp_path, tables, "position")
             assert f"parameters.{key.name}" in idle_keys(problem)
 
